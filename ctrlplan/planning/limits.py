@@ -692,6 +692,8 @@ class Limited:
 
     def violated_at_rest(self, plan: Trajectory) -> Iterator[tuple[Bound, float, Array]]:
         """Limits of positions and quantities that are violated at every duration, with the value and the position."""
+        if all(bound.in_loop or bound.kind == "rms" or _of_motion(bound) for bound in self.bounds):
+            return
         still = self.at_rest(plan)
         times = self._start + self._duration * still.fractions
         for k, values in enumerate(self.values(still.jet)):
@@ -738,6 +740,10 @@ class Limited:
 
     def _slackened(self, plan: Trajectory) -> Iterator[Bound]:
         """The bounds, with slack where they are attained at rest."""
+        if all(bound.axis is not None and bound.order and bound.is_constant for bound in self.bounds):  # 0 at rest
+            for bound in self.bounds:
+                yield replace(bound, slack=1e-12 if 0.0 in (bound.low, bound.high) else 0.0)
+            return
         try:
             self.values(self.sampled(plan).jet)
         except UndeterminedError:  # as at any other duration

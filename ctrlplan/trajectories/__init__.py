@@ -30,6 +30,7 @@ from ctrlplan.trajectories.retimed import Retimed
 from ctrlplan.trajectories.shaper_factor import ShaperFactor
 from ctrlplan.trajectories.shaping import Shaper
 from ctrlplan.trajectories.step import Step
+from ctrlplan.trajectories.time_law import TimeLaw
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.transition import Transition
 from ctrlplan.trajectories.trigonometric import FourierCoefficients, TrigSpline
@@ -58,6 +59,7 @@ __all__ = [
     "Stacked",
     "Step",
     "Sum",
+    "TimeLaw",
     "Trajectory",
     "Transition",
     "Trapezoid",

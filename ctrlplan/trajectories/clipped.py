@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan._checks import check_kind, checked_finite
 from ctrlplan._types import Data, Value
@@ -100,6 +101,15 @@ class Clipped(Trajectory):
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         return self.plan.segment_jet(self._first + segment, s + self._shifts[segment], order)
+
+    @property
+    def in_batches(self) -> bool:
+        """Whether segments are evaluated together, as those of the plan are."""
+        return self.plan.in_batches
+
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""
+        return self.plan.segments_jet(self._first + segments, s + self._shifts[segments], order)
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""

@@ -9,6 +9,7 @@ from operator import add
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_finite, checked_labels, default_labels
 from ctrlplan._display import counted
@@ -111,6 +112,16 @@ class _Combined(_OfParts):
         origin, end = self.breakpoints[segment : segment + 2].tolist()
         moment = 0.5 * (origin + end)
         return self._combine([part.segment_jet_at(moment, origin, s, order) for part in self.parts])
+
+    @property
+    def in_batches(self) -> bool:
+        """Whether segments are evaluated together, as those of a part are."""
+        return any(part.in_batches for part in self.parts)
+
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""
+        origins, ends = self.breakpoints[segments], self.breakpoints[segments + 1]
+        return self._combine([part.segments_jet_at(0.5 * (origins + ends), origins, s, order) for part in self.parts])
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
@@ -333,6 +344,21 @@ class Joined(_OfParts):
         """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""
         part, own = self._segments[segment]
         return part.segment_rows(own, s, order)
+
+    @property
+    def in_batches(self) -> bool:
+        """Whether segments are evaluated together, as those of a part are."""
+        return any(part.in_batches for part in self.parts)
+
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""
+        out = np.empty((order + 1, self.naxes, s.size))
+        first = 0
+        for part in self.parts:
+            inside = (segments >= first) & (segments < first + part.breakpoints.size - 1)
+            out[:, :, inside] = part.segments_jet(segments[inside] - first, s[inside], order)
+            first += part.breakpoints.size - 1
+        return out
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""

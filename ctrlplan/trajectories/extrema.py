@@ -13,6 +13,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan.trajectories.batches import inner_extrema
 from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, points, real_roots, transform
 from ctrlplan.trajectories.common import Array, readonly
 
@@ -88,11 +89,31 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     return Extrema(own.minimum.copy(), own.maximum.copy(), own.time_min.copy(), own.time_max.copy())
 
 
+def carry_extrema(plan: Trajectory, moved: Trajectory, rate: float) -> None:
+    """Keep the known extrema of a plan for the same plan at other times, whose rate is `rate`."""
+    known = _KNOWN.setdefault(moved, {})
+    for nu, own in _KNOWN.get(plan, {}).items():
+        with np.errstate(over="ignore", under="ignore"):
+            low, high = own.minimum * rate**nu, own.maximum * rate**nu
+        sizes = np.abs(np.concatenate([low, high]))
+        if np.isfinite(sizes).all() and (sizes[sizes > 0.0] > _TINY).all():
+            earliest, latest = (
+                np.where(
+                    t == plan.end, moved.end, np.clip(moved.start + (t - plan.start) / rate, moved.start, moved.end)
+                )
+                for t in (own.time_min, own.time_max)
+            )
+            known[nu] = Extrema(low, high, earliest, latest)
+
+
 def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     found = _Candidates()
     if nu == 0 or plan.breakpoints.size == 1:
         held = np.zeros((2, plan.naxes)) if nu else np.stack([plan.initial, plan.final])
         found.add(np.array([plan.start, plan.end]), held.T, (plan.start, plan.end))
+    if plan.in_batches:
+        _search_together(plan, nu, found)
+        return found.extrema()
     bounds = plan.derivative_bounds(nu)
     if bounds is None:
         for segment in range(plan.breakpoints.size - 1):
@@ -134,6 +155,17 @@ def _search_bounded(plan: Trajectory, nu: int, low: Array, high: Array, found: _
             values = _search(plan, nu, segment, found)
             least, largest = np.minimum(least, values.min(axis=1)), np.maximum(largest, values.max(axis=1))
             waiting[segment] = False
+
+
+def _search_together(plan: Trajectory, nu: int, found: _Candidates) -> None:
+    """Add candidates of all segments, which are evaluated together."""
+    breakpoints = plan.breakpoints
+    sides = [plan.jet(breakpoints[:-1], nu)[nu], plan.jet(breakpoints[1:], nu, left=True)[nu]]
+    values = np.concatenate(sides, axis=1)
+    found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), values)
+    segments, s = inner_extrema(plan, nu, values.min(axis=1), values.max(axis=1))
+    times = np.minimum(breakpoints[segments] + s, np.nextafter(breakpoints[segments + 1], -np.inf))
+    found.add(times, plan.segments_jet(segments, s, nu)[nu])
 
 
 def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: int) -> Array:

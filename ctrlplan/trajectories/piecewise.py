@@ -400,6 +400,27 @@ class PiecewiseSpline(WaypointSpline):
             out[:, list(pieces.axes)] = pieces.jet(segment, u, order) * scale
         return out
 
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""
+        if self._is_extreme(order) or not s.size:
+            return super().segments_jet(segments, s, order)
+        return self._jets(segments, s, 0, order)
+
+    def _is_extreme(self, order: int) -> bool:
+        """Whether powers of the durations may overflow."""
+        return max(abs(math.log10(self._durations.min())), abs(math.log10(self._durations.max()))) * order > _EXTREME
+
+    def _jets(self, segments: NDArray[np.intp], s: Array, low: int, high: int) -> Array:
+        """Derivatives low to high, each time in its own segment."""
+        h = self._durations[segments]
+        u, scale = s / h, scales(h, high)[low:, None]
+        if len(self._pieces) == 1:
+            return self._pieces[0].jets(segments, u, high)[low:] * scale
+        out = np.empty((high - low + 1, self.naxes, s.size))
+        for pieces in self._pieces:
+            out[:, list(pieces.axes)] = pieces.jets(segments, u, high)[low:] * scale
+        return out
+
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         if t.size == 1:
             rows = self._rows(float(t[0]), high, left)
@@ -410,21 +431,11 @@ class PiecewiseSpline(WaypointSpline):
         if not left:
             segments[t == times[-1]] = last
         inside = (segments >= 0) & (segments <= last)
-        extreme = max(abs(math.log10(self._durations.min())), abs(math.log10(self._durations.max()))) * high > _EXTREME
         touched = min(int(np.count_nonzero(np.diff(segments))) + 1, last + 1)
-        if touched <= _FEW or t.size > _MANY * touched or extreme or not inside.all():
+        if touched <= _FEW or t.size > _MANY * touched or self._is_extreme(high) or not inside.all():
             return super()._sample(t, low, high, left)
-        h = self._durations[segments]
-        u = (t - times[segments]) / h
-        out = np.empty((high - low + 1, self.naxes, t.size))
         with np.errstate(over="ignore", invalid="ignore"):
-            scale = scales(h, high)[low:, None]
-            for pieces in self._pieces:
-                own = pieces.jets(segments, u, high)[low:] * scale
-                if len(self._pieces) == 1:
-                    out = own
-                else:
-                    out[:, list(pieces.axes)] = own
+            out = self._jets(segments, t - times[segments], low, high)
         return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
     _rows = WaypointSpline._rows  # `_sample` calls it

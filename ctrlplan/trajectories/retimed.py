@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_labels
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.combined import is_shaped, is_unit_rate
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
+from ctrlplan.trajectories.time_law import TimeLaw
 from ctrlplan.trajectories.trajectory import Trajectory
 
 _ROUNDING = 1e-12
@@ -60,7 +62,7 @@ class Retimed(Trajectory):
     law: Trajectory
     initial: Array
     final: Array
-    _segments: list[tuple[int, int]]  # of the law, and of the plan, for each segment
+    _of_segments: NDArray[np.intp]  # (2, nsegments), segments of the law and of the plan
 
     def __init__(self, plan: Trajectory, law: Trajectory, labels: Sequence[str] | None = None) -> None:
         for name, value in (("plan", plan), ("law", law)):
@@ -71,9 +73,7 @@ class Retimed(Trajectory):
         values = _checked_law(plan, law, slack)
         passed = np.array([_passing(law, values, float(b), slack) for b in plan.breakpoints[1:-1]])
         breakpoints = np.union1d(law.breakpoints, passed)
-        segments = [
-            np.searchsorted(times, breakpoints[:-1], side="right").tolist() for times in (law.breakpoints[1:], passed)
-        ]
+        segments = [np.searchsorted(times, breakpoints[:-1], side="right") for times in (law.breakpoints[1:], passed)]
         self._set_fields(
             plan=plan,
             law=law,
@@ -81,7 +81,7 @@ class Retimed(Trajectory):
             breakpoints=readonly(breakpoints),
             initial=plan.initial,
             final=plan.final,
-            _segments=list(zip(*segments, strict=True)),
+            _of_segments=np.stack(segments),
         )
 
     def to_dict(self) -> Data:
@@ -113,9 +113,22 @@ class Retimed(Trajectory):
             out[:, :, at_end] = _composed_jets(*jets)[low:]
         return out
 
+    @property
+    def in_batches(self) -> bool:
+        """Whether segments are evaluated together, as those of the law are."""
+        return self.law.in_batches
+
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""
+        of_law, of_plan = self._of_segments[:, segments]
+        since = self.breakpoints[segments] - self.law.breakpoints[of_law]
+        inner = self.law.segments_jet(of_law, s + since, order)
+        elapsed = inner[0, 0] - self.plan.breakpoints[of_plan]
+        return _composed_jets(self.plan.segments_jet(of_plan, elapsed, order), inner)
+
     def law_jet(self, segment: int, s: Array, order: int) -> tuple[Array, int]:
         """Derivatives (order + 1, 1, ntime) of the law in a segment, and the number of the plan's segment there."""
-        of_law, of_plan = self._segments[segment]
+        of_law, of_plan = self._of_segments[:, segment].tolist()
         return self.law.segment_jet(of_law, s + self._since(segment), order), of_plan
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
@@ -126,14 +139,14 @@ class Retimed(Trajectory):
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
-        of_law, of_plan = self._segments[segment]
+        of_law, of_plan = self._of_segments[:, segment].tolist()
         ((time, *rates),) = self.law.segment_series(of_law, s + self._since(segment), order)
         elapsed = time - float(self.plan.breakpoints[of_plan])
         return [composed(row, rates) for row in self.plan.segment_series(of_plan, elapsed, order)]
 
     def _since(self, segment: int) -> float:
         """Time [s] from the start of the law's segment to the start of a segment of this plan."""
-        return float(self.breakpoints[segment] - self.law.breakpoints[self._segments[segment][0]])
+        return float(self.breakpoints[segment] - self.law.breakpoints[self._of_segments[0, segment]])
 
 
 def composed(outer: Sequence[Value], inner: Sequence[Value]) -> list[Value]:
@@ -171,12 +184,14 @@ def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
         raise ValueError("plan must have a duration, got a step")
     if law.naxes != 1:
         raise ValueError(f"law must have one axis, got {law.naxes}: {', '.join(law.labels)}")
-    values = law(law.breakpoints)
+    values = law.positions if isinstance(law, TimeLaw) else law(law.breakpoints)
     first, last = float(law.initial[0]), float(law.final[0])
     if max(abs(first - plan.start), abs(last - plan.end)) > slack:
         raise ValueError(
             f"law must lead from the plan's start {plan.start} s to its end {plan.end} s, got {first} to {last}"
         )
+    if isinstance(law, TimeLaw) and not is_shaped(plan):  # continuous and increasing
+        return values
     for jump in law.jumps(0):
         raise ValueError(f"law must be continuous, got a jump by {jump.size:g} at {jump.time:g} s")
     rate = law.extrema(1)

@@ -10,11 +10,15 @@ are as accurate as the jets: series are truncated below rounding.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ctrlplan.trajectories.chebyshev import chebyshev_proxy
 from ctrlplan.trajectories.common import FACTORIALS, Array
+
+if TYPE_CHECKING:
+    from ctrlplan.trajectories.trajectory import Trajectory
 
 FEW = 4096
 """Number of times up to which the jets themselves are evaluated."""
@@ -57,6 +61,25 @@ def sample(jet: Callable[[Array, int], Array], duration: float, t: Array, low: i
                 return _sample_sorted(jet, t, ncells, low, high, terms)
     proxy = chebyshev_proxy(jet, (0.0, duration), low, high)
     return _sample_chunks(jet, t, low, high) if proxy is None else _sample_proxy(proxy, duration, t)
+
+
+def sample_in_batches(plan: Trajectory, t: Array, low: int, high: int, left: bool) -> Array:
+    """Derivatives low to high (high - low + 1, naxes, ntime) of a trajectory whose segments are evaluated together."""
+    times, last = plan.breakpoints, plan.breakpoints.size - 2
+    segments = np.searchsorted(times, t, side="left" if left else "right") - 1
+    if not left:
+        segments[t == times[-1]] = last
+    inside = np.flatnonzero((segments >= 0) & (segments <= last))
+    found = plan.segments_jet(segments[inside], t[inside] - times[segments[inside]], high)[low:]
+    if inside.size == t.size:
+        return found
+    out = np.zeros((high - low + 1, plan.naxes, t.size))
+    out[:, :, inside] = found
+    if low == 0:
+        out[0] += np.where(segments < 0, plan.initial[:, None], 0.0) + np.where(
+            segments > last, plan.final[:, None], 0.0
+        )
+    return out
 
 
 def _is_uniform(t: Array, duration: float) -> bool:

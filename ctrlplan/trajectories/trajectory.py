@@ -150,6 +150,34 @@ class Trajectory(Displayed, Fields, ABC):
         ndarray, shape (order + 1, naxes, ntime)
         """
 
+    @property
+    def in_batches(self) -> bool:
+        """Whether segments are evaluated together."""
+        return False
+
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives of the analytic functions of many segments.
+
+        Parameters
+        ----------
+        segments : ndarray of int, shape (ntime,)
+            Numbers of the segments, in any order.
+        s : ndarray, shape (ntime,)
+            Times [s] since the start of each of these segments.
+        order : int
+            Highest derivative.
+
+        Returns
+        -------
+        ndarray, shape (order + 1, naxes, ntime)
+        """
+        out = np.empty((order + 1, self.naxes, s.size))
+        by_segment = np.argsort(segments, kind="stable")
+        first = np.flatnonzero(np.diff(segments[by_segment], prepend=-1))
+        for where in np.split(by_segment, first[1:]) if s.size else ():
+            out[:, :, where] = self.segment_jet(int(segments[where[0]]), s[where], order)
+        return out
+
     @abstractmethod
     def map_time(self, origin: float, target: float, rate: float) -> Self:
         """Same path with time t moved to target + (t - origin)/rate.
@@ -947,10 +975,13 @@ class Trajectory(Displayed, Fields, ABC):
                 moved = self.map_time(origin, target, rate)
         except FloatingPointError as error:
             raise ValueError(f"times must stay within floating point, got a rate of {rate:g}: {error}") from None
+        if self.in_batches:
+            _extrema.carry_extrema(self, moved, rate)
         before, after = (np.union1d(p.breakpoints, [w.time for w in p.waypoints]) for p in (self, moved))
         if before.size < 2:
             return moved
-        if before.size != after.size:  # a profile omits segments below the resolution of times
+        # A profile omits segments below the resolution of times; the cells of a time law do not depend on it.
+        if before.size != after.size or self.in_batches:
             before, after = before[[0, -1]], after[[0, -1]]
         loss = float(np.abs(np.diff(after) * rate / np.diff(before) - 1.0).max())
         if loss > 1e-6:
@@ -991,6 +1022,8 @@ class Trajectory(Displayed, Fields, ABC):
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         """Derivatives low to high, shape (high - low + 1, naxes, ntime)."""
+        if self.in_batches:
+            return _sampling.sample_in_batches(self, t, low, high, left)
         nsegments = self.breakpoints.size - 1
         if nsegments == 1 and not left and t.size and t.min() >= self.breakpoints[0] and t.max() <= self.breakpoints[1]:
             origin = self.breakpoints[0]
@@ -1075,6 +1108,18 @@ class Trajectory(Displayed, Fields, ABC):
         held = np.zeros((order + 1, self.naxes, s.size))
         held[0] = (self.initial if segment < 0 else self.final)[:, None]
         return held
+
+    def segments_jet_at(self, moments: Array, origins: Array, s: Array, order: int) -> Array:
+        """Jets at many moments, each with its origin; as `segment_jet_at`."""
+        segments = np.searchsorted(self.breakpoints, moments) - 1
+        inside = (segments >= 0) & (segments < self.breakpoints.size - 1)
+        if inside.all():
+            return self.segments_jet(segments, s + (origins - self.breakpoints[segments]), order)
+        out = np.zeros((order + 1, self.naxes, s.size))
+        out[0] = np.where(segments < 0, self.initial[:, None], self.final[:, None])
+        own = segments[inside]
+        out[:, :, inside] = self.segments_jet(own, s[inside] + (origins[inside] - self.breakpoints[own]), order)
+        return out
 
     def segment_rows_at(self, moment: float, origin: float, s: float, order: int) -> list[list[float]] | None:
         """Derivatives by axis at one time; as `segment_jet_at`."""

@@ -400,14 +400,20 @@ CLOSED = {
 }
 
 
+@pytest.mark.parametrize("hold", ["shape", "path"])
 @pytest.mark.parametrize("name", CLOSED)
-def test_a_time_law_would_open_a_closed_plan(name):
-    plan = CLOSED[name]
-    with pytest.raises(ValueError, match="hold must be 'shape' or 'waypoints' for a closed plan, got 'path'"):
-        fastest(plan, {"velocity": 2.0, "acceleration": 3.0}, hold="path")
-    found = fastest(plan, {"velocity": 2.0, "acceleration": 3.0}).plan
-    first, last = found.jet(found.start, 1), found.jet(found.end, 1)
+def test_a_closed_plan_stays_closed(name, hold):
+    found = fastest(CLOSED[name], {"velocity": 2.0, "acceleration": 3.0}, hold=hold).plan
+    first, last = found.jet(found.start, 1), found.jet(found.end, 1, left=True)
     np.testing.assert_allclose(first, last, rtol=0, atol=1e-8 * found.peak()[:, None].max())
+    jet = np.abs(found.jet(np.linspace(found.start, found.end, COUNT), 2)).max(axis=(1, 2))
+    assert jet[1] <= 2.0 * (1 + 1e-11)
+    assert jet[2] <= 3.0 * (1 + 1e-11)
+
+
+def test_a_time_law_with_limited_jerk_would_open_a_closed_plan():
+    with pytest.raises(ValueError, match="hold must be 'shape' or 'waypoints' for a closed plan, got 'path'"):
+        fastest(CYCLE, {"velocity": 2.0, "jerk": 30.0}, hold="path")
 
 
 @pytest.mark.slow

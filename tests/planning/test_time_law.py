@@ -100,8 +100,7 @@ def test_the_time_law_is_increasing(name):
     assert rate.min() > 0.0
 
 
-def test_the_time_law_has_four_continuous_derivatives():
-    law = law_of(found_on_path("obstacle").plan)
+def check_four_continuous_derivatives(law):
     inner = law.breakpoints[1:-1]
     right, left = law.jet(inner, 4)[:, 0], law.jet(inner, 4, left=True)[:, 0]
     size = np.abs(sampled(law, 4, 2001)[:, 0]).max(axis=1)
@@ -114,7 +113,7 @@ def test_the_time_law_has_four_continuous_derivatives():
 def test_straight_moves_come_near_the_trapezoid(kind, distance, velocity, acceleration):
     found = fastest(move(kind, distance), {"y_d1": velocity, "y_d2": acceleration}, hold="path")
     best = trapezoid(distance, velocity, acceleration)
-    assert best * (1 - 1e-9) <= found.duration <= 1.05 * best
+    assert best * (1 - 1e-9) <= found.duration <= 1.004 * best
     jet = np.abs(sampled(found.plan, 2)[:, 0])
     assert jet[1].max() <= velocity * (1 + 1e-11)
     assert jet[2].max() <= acceleration * (1 + 1e-11)
@@ -127,13 +126,13 @@ def test_every_trapezoid(kind, ratio):
     # v^2/(a d) alone decides on the form of the trapezoid.
     found = fastest(move(kind, ratio), {"y_d1": 1.0, "y_d2": 1.0}, hold="path")
     best = trapezoid(ratio, 1.0, 1.0)
-    assert best * (1 - 1e-9) <= found.duration <= 1.05 * best
+    assert best * (1 - 1e-9) <= found.duration <= 1.004 * best
 
 
 @pytest.mark.slow
 def test_a_velocity_limit_alone():
     found = fastest(move("quintic"), {"y_d1": 2.0}, hold="path")
-    assert 0.5 <= found.duration <= 1.05 * 0.5
+    assert 0.5 <= found.duration <= 1.004 * 0.5
 
 
 def test_a_line_at_constant_speed_stays_one():
@@ -149,7 +148,7 @@ def test_unequal_sides_turn_the_trapezoid():
     distance, velocity, up, down = 10.0, 1.0, 0.5, 1.0
     found = fastest(move("quintic", distance), {"y_d1": velocity, "y_d2": (-down, up)}, hold="path")
     best = distance / velocity + 0.5 * velocity * (1 / up + 1 / down)
-    assert best <= found.duration <= 1.05 * best
+    assert best <= found.duration <= 1.004 * best
     acceleration = sampled(found.plan, 2)[2, 0]
     assert -down * (1 + 1e-11) <= acceleration.min() < -0.9 * down
     assert 0.9 * up < acceleration.max() <= up * (1 + 1e-11)
@@ -187,6 +186,7 @@ def test_crane_forces_are_within_limits_with_the_new_time_law(force):
     limits = {"F": force, "C": (-3e3, 1e3), "theta": 0.5}
     shape, path = fastest(HOIST, limits, CRANE), fastest(HOIST, limits, CRANE, hold="path")
     assert path.duration < 0.95 * shape.duration
+    check_four_continuous_derivatives(law_of(path.plan))
     found = crane_force(path.plan)
     # Finite differences of a force have rounding errors.
     assert np.abs(found).max() == pytest.approx(force, rel=1e-3)
@@ -216,7 +216,7 @@ def test_sway_is_limited_on_the_path():
 def test_position_limits_stay_what_they_are():
     plan = PLANS["nominal"]
     found = fastest(plan, {"x": (0, 20), "z": (10, 11), "x_d1": 2.0, "x_d2": 0.5}, hold="path")
-    assert trapezoid(20.0, 2.0, 0.5) <= found.duration <= 1.05 * trapezoid(20.0, 2.0, 0.5)
+    assert trapezoid(20.0, 2.0, 0.5) <= found.duration <= 1.004 * trapezoid(20.0, 2.0, 0.5)
     # The path is held, and its positions with it: limits that it touches leave the time law as it is.
     assert found.duration == pytest.approx(fastest(plan, {"x_d1": 2.0, "x_d2": 0.5}, hold="path").duration, rel=1e-9)
     with pytest.raises(ValueError, match="limits must be satisfied at rest"):
@@ -239,5 +239,5 @@ def test_the_fastest_plan_is_invariant_under_units_and_time_shifts(size, duratio
     plan = (size * move("quintic")).retime(duration).shift(start)
     limits = {"y_d1": size * 1.0, "y_d2": size * 1.0}
     found = fastest(plan, limits, hold="path")
-    assert trapezoid(1.0, 1.0, 1.0) <= found.duration <= 1.05 * trapezoid(1.0, 1.0, 1.0)
+    assert trapezoid(1.0, 1.0, 1.0) <= found.duration <= 1.004 * trapezoid(1.0, 1.0, 1.0)
     assert found.plan.start == start

@@ -19,6 +19,7 @@ from ctrlplan.trajectories import (
     SCurve,
     Shaper,
     Step,
+    TimeLaw,
     Trajectory,
     Trapezoid,
     TrigSpline,
@@ -49,6 +50,7 @@ SAVED = [
         Shaper.zv(5.0)(MOVE),
         Retimed(MOVE, PolySpline([Waypoint(0, 0), Waypoint(3, 1)])),
         PathPlan([PolySpline([Waypoint(0, [0, 0], [1, 0]), Waypoint(1, [1, 1], [1, 2])])], [1], MOVE),
+        TimeLaw([0, 1, 2], [[0, 4], [2, 4], [4, 0]], 1.0),
     )
 ]
 HOSTILE = [

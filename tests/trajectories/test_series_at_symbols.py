@@ -26,6 +26,7 @@ from ctrlplan.trajectories import (
     Stacked,
     Step,
     Sum,
+    TimeLaw,
     Trajectory,
     Trapezoid,
     TrigSpline,
@@ -73,6 +74,7 @@ PLANS = {
     "Clipped": Clipped(PiecewiseSpline(POINTS), -0.6, 1.1),
     "MotionProfile": MotionProfile([-0.5, 1.0, 3.0], [[2.0, -1.0], [0.0, 0.5]], [[1.0, 2.0], [0.5, -0.3], [0.1, 0.0]]),
     "PiecewisePolynomial": PiecewisePolynomial([-0.5, 1.0, 3.0], [[[2.0, 0.3], [0.0, 0.5]], [[1.0, 2.0], [0.5, -0.3]]]),
+    "TimeLaw": TimeLaw([-1.0, 0.5, 1.0, 2.0], [[0.0, 1.0, 0.5], [2.0, 0.2, 0.75], [1.0, 0.5, 1.0]], -0.5),
     # kinds with options
     "of a higher degree": PolySpline(POINTS, degree=9),
     "trigonometric of a higher degree": TrigSpline(POINTS, alpha=2.0, degree=7),
@@ -84,6 +86,7 @@ PLANS = {
     "retimed and shifted": TrigSpline(POINTS, alpha=1.3).retime(7.0).shift(2.5),
     "stopped": POLY.stop(1.2, {"acceleration": 9.0, "jerk": 40.0}),
     "stopped on its path": POLY.stop(-0.3, {"acceleration": 40.0, "jerk": 400.0}, synchronize="path"),
+    "on its path with a given squared rate": Retimed(POLY, TimeLaw([-1.0, 1.0, 2.0], [[0, 40], [60, 1], [40, 0]])),
     # one made of another
     "joined of scaled": (2.0 * POLY).then(2.0 * TRIG),
     "joined of stacked": stack([rest((0, 0), (1, 1)), rest((0, 2), (3, 1))]).then(

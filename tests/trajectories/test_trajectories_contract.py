@@ -47,6 +47,8 @@ ARGUMENTS = {
     "breakpoints": lambda: [0.5, 1.25, 2.0],
     "coefficients": lambda: [[[0.5, -1.0], [1 / 3, 2.0]], [[2.0, 0.0], [-1.0, 1.0]], [[1.0, -3.0], [2.0, 0.7]]],
     "values": lambda: [[1.0, -3.0], [0.5, 0.0]],
+    "positions": lambda: [0.5, 1.25, 2.0],
+    "squared_rates": lambda: [[0.3, 1.1], [0.6, 2.0], [1.1, 0.7]],
     "start_state": lambda: [[1.0, 2.0], [0.5, -1.0], [0.1, 0.0]],
     "law": lambda: trajectories.PolySpline([Waypoint(3.0, -1.0, 0.7), Waypoint(4.0, 0.1), Waypoint(7.5, 2.0, 0.3)]),
 }

@@ -1,0 +1,14 @@
+"""Time law of minimum duration on the path of a plan.
+
+With the squared rate b(s) = (ds/dt)^2 of the path parameter s, limits of
+velocities, p' sqrt(b), and accelerations, p'' b + p' b'/2, are linear in b and b',
+and the duration, the integral of 1/sqrt(b), is convex. b is a quadratic spline. The plan is
+divided at its stops (`spans`) into cells (`grid`), limits are inequalities for each
+cell (`rows`), a feasible law is found by two passes (`sweep`), and the fastest one
+by an interior-point method (`interior_point`); cells that are not at a limit are
+divided (`law`).
+"""
+
+from ctrlplan.planning.path_law.law import FastLaw, fastest_law
+
+__all__ = ["FastLaw", "fastest_law"]

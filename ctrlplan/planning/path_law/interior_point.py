@@ -1,0 +1,182 @@
+"""Minimum duration for linear inequalities of the squared rate, by a primal-dual interior-point method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from ctrlplan.planning.path_law.grid import Spline
+from ctrlplan.trajectories.common import Array
+
+_GAP = 1e-3
+"""Duality gap relative to the duration."""
+
+_ROUNDS = 60
+
+_STEP = 0.98
+"""Step relative to the longest one within the inequalities."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Minimise sum of weights/sqrt(points @ x) for lower <= rows @ x <= upper and x >= 0.
+
+    Attributes
+    ----------
+    spline : Spline
+        Unknowns of each cell.
+    points : ndarray, shape (size, npoints, ncells)
+        Squared rates at the points of a quadrature, by the coefficients of a cell.
+    weights : ndarray, shape (npoints, ncells)
+        Weights of the quadrature [s].
+    rows : ndarray, shape (size, nrows, ncells)
+        Rows of the inequalities, by the coefficients of a cell.
+    upper, lower : ndarray, shape (nrows, ncells), (ntwo, ncells)
+        Limits, upper ones above 0; lower ones, below 0, of the first rows.
+    """
+
+    spline: Spline
+    points: Array
+    weights: Array
+    rows: Array
+    upper: Array
+    lower: Array
+
+    def feasible_scale(self, x: Array) -> float:
+        """Largest factor of coefficients for which the inequalities hold."""
+        values = _applied(self.rows, x[self.spline.index])
+        below = values[: len(self.lower)] / self.lower
+        return 1.0 / max(float((values / self.upper).max()), float(below.max(initial=0.0)))
+
+
+def minimum(problem: Problem, start: Array) -> Array:
+    """Coefficients of minimum duration.
+
+    By Mehrotra's predictor-corrector method; the matrices of its equations are
+    banded.
+
+    Parameters
+    ----------
+    problem : Problem
+        Objective and inequalities.
+    start : ndarray, shape (size,)
+        Coefficients that satisfy all inequalities strictly; 0 where prescribed.
+    """
+    return _Search(problem, start).minimum()
+
+
+class _Search:
+    """Iteration of coefficients x relative to the start, slacks w of all inequalities, and multipliers y."""
+
+    def __init__(self, problem: Problem, start: Array) -> None:
+        spline = problem.spline
+        self._index, self._size, self._bandwidth = spline.index, spline.size, spline.bandwidth
+        self._fixed, self._scale = spline.fixed, np.where(spline.fixed, 1.0, start)
+        own = self._scale[spline.index]
+        self._points, self._weights = problem.points * own[:, None], problem.weights
+        self._rows, self._upper, self._lower = problem.rows * own[:, None], problem.upper, problem.lower
+        self._pairs = [(i, j) for i in range(len(own)) for j in range(i, len(own))]
+        ends = np.sort(np.stack([self._index[[i, j]] for i, j in self._pairs]), axis=1)
+        self._place = (ends[:, 1] - ends[:, 0]) * self._size + ends[:, 0]  # in the lower bands
+
+    def minimum(self) -> Array:
+        """Coefficients at the optimum."""
+        x = np.where(self._fixed, 0.0, 1.0)
+        w = self._slacks(x)
+        active: Array = np.append(np.ones(w.size - x.size), np.where(self._fixed, 0.0, 1.0))
+        # At the optimum the sum of the multipliers of normalised limits is half the duration.
+        y = active * 0.5 * self._duration(x) / (active / w).sum() / w
+        for _ in range(_ROUNDS):
+            gradient, curvature = self._objective(x)
+            gap, tolerance = float(y @ w), _GAP * self._duration(x)
+            residual = np.where(self._fixed, 0.0, x * (gradient - self._pulled(y)))
+            if gap < tolerance and np.abs(residual).sum() < tolerance:
+                break
+            solve = self._solver(curvature, y / w)
+            dx = solve(-gradient)
+            dw = self._changes(dx)
+            dy = -y - y * dw / w
+            reached = float((w + _longest(w, dw) * dw) @ (y + _longest(y, dy) * dy))
+            target = active * (gap / active.sum() * (reached / gap) ** 3 - dw * dy)
+            dx = solve(self._pulled(target / w) - gradient)
+            dw = self._changes(dx)
+            dy = (target - y * dw) / w - y
+            primal, dual = (min(1.0, _STEP * _longest(own, change, 2.0)) for own, change in ((w, dw), (y, dy)))
+            x, w, y = x + primal * dx, w + primal * dw, y + dual * dy
+        return self._scale * x
+
+    def _duration(self, x: Array) -> float:
+        return float((self._weights / np.sqrt(_applied(self._points, x[self._index]))).sum())
+
+    def _objective(self, x: Array) -> tuple[Array, Array]:
+        """Gradient of the duration, and second derivatives by the squared rates at the points."""
+        b = _applied(self._points, x[self._index])
+        first = -0.5 * self._weights / (b * np.sqrt(b))
+        return self._gathered(self._points, first), -1.5 * first / b
+
+    def _slacks(self, x: Array) -> Array:
+        """Distances from all limits; 1 for a prescribed coefficient."""
+        values = _applied(self._rows, x[self._index])
+        below = values[: len(self._lower)] - self._lower
+        return np.concatenate([(self._upper - values).ravel(), below.ravel(), np.where(self._fixed, 1.0, x)])
+
+    def _changes(self, dx: Array) -> Array:
+        """Changes of the slacks with coefficients."""
+        values = _applied(self._rows, dx[self._index])
+        return np.concatenate([-values.ravel(), values[: len(self._lower)].ravel(), dx])
+
+    def _by_row(self, values: Array, sign: float) -> tuple[Array, Array]:
+        """Values of the slacks of both limits of each row, with a sign of the upper one; those of coefficients."""
+        count, two = self._upper.size, self._lower.size
+        rows = sign * values[:count].reshape(self._upper.shape)
+        rows[: len(self._lower)] += values[count : count + two].reshape(self._lower.shape)
+        return rows, values[count + two :]
+
+    def _pulled(self, values: Array) -> Array:
+        """Transposed changes of the slacks."""
+        rows, own = self._by_row(values, -1.0)
+        return self._gathered(self._rows, rows) + own
+
+    def _gathered(self, rows: Array, values: Array) -> Array:
+        """Transposed products of rows (size, nrows, ncells) with values (nrows, ncells)."""
+        found = np.einsum("mrc,rc->mc", rows, values)
+        return _summed(self._index, found, self._size)
+
+    def _solver(self, curvature: Array, stiffness: Array) -> Callable[[Array], Array]:
+        """Solution of the equations of a step."""
+        of_rows, own = self._by_row(stiffness, 1.0)
+        points, rows = self._points * curvature, self._rows * of_rows
+        terms = np.stack([(points[i] * self._points[j]).sum(axis=0) for i, j in self._pairs])
+        terms += np.stack([(rows[i] * self._rows[j]).sum(axis=0) for i, j in self._pairs])
+        if self._fixed.any():
+            fixed = self._fixed[self._index]
+            terms[np.stack([fixed[i] | fixed[j] for i, j in self._pairs])] = 0.0
+        bands = _summed(self._place, terms, (self._bandwidth + 1) * self._size).reshape(self._bandwidth + 1, self._size)
+        bands[0] += np.where(self._fixed, 1.0, own)
+        factor = cholesky_banded(bands, lower=True, check_finite=False, overwrite_ab=True)
+        free = ~self._fixed
+        return lambda right: free * cho_solve_banded((factor, True), free * right, check_finite=False)
+
+
+def _applied(rows: Array, x: Array) -> Array:
+    """Products (nrows, ncells) of rows (size, nrows, ncells) with coefficients (size, ncells)."""
+    found = rows[0] * x[0]
+    for row, own in zip(rows[1:], x[1:], strict=True):
+        found += row * own
+    return found
+
+
+def _summed(index: NDArray[np.intp], values: Array, size: int) -> Array:
+    """Sums of values with the same index."""
+    return np.bincount(index.ravel(), values.ravel(), size).astype(float, copy=False)
+
+
+def _longest(values: Array, changes: Array, cap: float = 1.0) -> float:
+    """Longest step, up to `cap`, for which values of at least 0 remain so."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = float(np.fmax.reduce(-changes / values))
+    return min(cap, 1.0 / ratio) if ratio > 0.0 else cap

@@ -1,0 +1,118 @@
+"""Time law of minimum duration by successive refinement of the cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctrlplan.planning.bounds import Bound
+from ctrlplan.planning.path_law.grid import Grid, Spline
+from ctrlplan.planning.path_law.interior_point import Problem, minimum
+from ctrlplan.planning.path_law.rows import POINTS, Activity, Rows, basis
+from ctrlplan.planning.path_law.spans import Part, parts_of
+from ctrlplan.planning.path_law.sweep import swept
+from ctrlplan.trajectories import Retimed, TimeLaw, Trajectory
+from ctrlplan.trajectories.common import Array, readonly
+
+_NODES, _WEIGHTS = (readonly(0.5 * values) for values in np.polynomial.legendre.leggauss(4) + np.array([[1.0], [0.0]]))
+"""Quadrature of the duration of a cell."""
+
+_MEANS = readonly(np.array([1.0, 3.0, 3.0, 1.0]) / 8.0)
+"""Quadrature at the points at which limits are evaluated."""
+
+_LOSS = 5e-3
+"""Mean distance from the nearest limit over the time of the plan below which cells are not divided any more."""
+
+_REFINEMENTS, _PIECES = 4, 4
+"""Maximum number of refinements, and of the pieces into which a cell is divided in each."""
+
+_START = 0.9
+"""Feasible start relative to the limits."""
+
+
+@dataclass(frozen=True)
+class FastLaw:
+    """Plan with a fast time law.
+
+    Attributes
+    ----------
+    plan : Retimed
+        Plan that satisfies the limits up to a small violation between points of the cells.
+    stops : tuple of float
+        Times [s] of the given plan at which the path has corners, where the law stops.
+    """
+
+    plan: Retimed
+    stops: tuple[float, ...]
+
+
+def fastest_law(plan: Trajectory, bounds: Sequence[Bound], start: float) -> FastLaw:
+    """Time law of minimum duration under limits of velocities and accelerations.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        Plan with a duration and without jumps of the position.
+    bounds : sequence of Bound
+        Limits of first and second derivatives of axes.
+    start : float
+        Start [s] of the plan for which limits over time are given.
+
+    Raises
+    ------
+    ValueError
+        If the rate is not limited.
+    """
+    parts = parts_of(plan, any(bound.order == 2 for bound in bounds))
+    grid = Grid.of(plan, [part for part in parts if part.moves])
+    for refinement in range(_REFINEMENTS + 1):
+        spline, activity = Spline.of(grid), Activity.of(grid, bounds, POINTS, start)
+        rows = activity.rows(grid.sizes)
+        problem = _problem(grid, spline, rows)
+        x = swept(grid, spline, rows)
+        x = minimum(problem, _START * problem.feasible_scale(x) * x)
+        local = spline.coefficients(x)
+        loss = _losses(activity.worst(POINTS, local, grid.sizes), local, grid.sizes)
+        if loss.sum() < _LOSS or refinement == _REFINEMENTS:
+            break
+        grid = grid.divided(np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int))
+    return FastLaw(Retimed(plan, _law(plan, parts, grid, local)), _corners(plan, parts))
+
+
+def _problem(grid: Grid, spline: Spline, rows: Rows) -> Problem:
+    """Duration by quadrature, and inequalities, for the coefficients of a spline."""
+    values = np.repeat(basis(_NODES)[0][:, None], grid.sizes.size, axis=1)
+    weights = _WEIGHTS[:, None] * grid.sizes
+    # 1/sqrt(b) is integrated by the square root of the distance from a point at which b is 0.
+    root = 2.0 * _NODES[:, None]
+    first, last = grid.halts
+    values[:, first], weights[:, first] = basis(_NODES**2)[0][:, None], weights[:, first] * root
+    values[:, last], weights[:, last] = basis(1.0 - _NODES**2)[0][:, None], weights[:, last] * root
+    return Problem(spline, spline.rows(values), weights, spline.rows(rows.factors), rows.upper, rows.lower)
+
+
+def _losses(worst: Array, local: Array, sizes: Array) -> Array:
+    """Distance of each cell from the nearest limit, weighted by its part of the duration."""
+    durations = sizes / np.sqrt(_MEANS @ (basis(POINTS)[0] @ local))
+    distance = _MEANS @ np.maximum(1.0 - worst, 0.0)
+    return distance * durations / durations.sum()
+
+
+def _law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array) -> TimeLaw:
+    """Time law from the Bernstein coefficients (3, ncells) of the moving parts; dwells keep their duration."""
+    dwells = [span for part in parts if not part.moves for span in part.spans]
+    own = [plan.breakpoints[span.segment] + span.start for span in dwells]
+    places = np.append(plan.breakpoints[grid.segment] + grid.start, own)
+    rates = np.append(local * grid.units**2, np.ones((3, len(own))), axis=1)
+    order = np.argsort(places)
+    return TimeLaw(np.append(places[order], plan.end), rates[:, order], plan.start)
+
+
+def _corners(plan: Trajectory, parts: Sequence[Part]) -> tuple[float, ...]:
+    """Times [s] of the plan at which its path has a corner."""
+    ends, starts = ([part for part in parts if part.moves and part.halts[side]] for side in (1, 0))
+    times = [plan.breakpoints[part.spans[-1].segment] + part.spans[-1].end for part in ends]
+    times += [plan.breakpoints[part.spans[0].segment] + part.spans[0].start for part in starts]
+    return tuple(np.unique(times).tolist())

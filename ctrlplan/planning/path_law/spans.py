@@ -1,0 +1,186 @@
+"""Division of a plan into spans between stops, corners and waypoints, and of spans into cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories.common import Array
+
+_STILL = 1e-9
+"""Velocity below which a plan is at rest, relative to its peak."""
+
+_NEAR = 0.01
+"""Distance from the end of a span at which its velocity is compared with that at twice the distance."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """Part of a plan that is analytic.
+
+    Attributes
+    ----------
+    segment : int
+        Segment of the plan.
+    start, end : float
+        Times [s] since the start of the segment.
+    moves : bool
+        Whether the plan moves; otherwise it dwells.
+    rests : (float, float)
+        Power of the distance from each end with which the velocity increases from
+        there; 0 where it is not 0.
+    """
+
+    segment: int
+    start: float
+    end: float
+    moves: bool
+    rests: tuple[float, float]
+
+    @property
+    def length(self) -> float:
+        """Duration [s] in the plan."""
+        return self.end - self.start
+
+
+@dataclass(frozen=True)
+class Part:
+    """Consecutive spans through which the path is followed without a stop.
+
+    Attributes
+    ----------
+    spans : tuple of Span
+        The spans.
+    units : tuple of float
+        Unit of time of each span, with which the tangent of the path is continuous.
+    halts : (bool, bool)
+        Whether the path has a corner at each end, at which it must be at rest.
+    closed : bool
+        Whether the end is continued by the start.
+    """
+
+    spans: tuple[Span, ...]
+    units: tuple[float, ...]
+    halts: tuple[bool, bool]
+    closed: bool = False
+
+    @property
+    def moves(self) -> bool:
+        """Whether the plan moves; otherwise it dwells."""
+        return self.spans[0].moves
+
+
+def parts_of(plan: Trajectory, stops: bool) -> list[Part]:
+    """Parts of a plan, dwells included.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        Plan with a duration and without jumps of the position.
+    stops : bool
+        Whether the plan stops at corners of the path.
+    """
+    spans, joints = _spans(plan, stops)
+    ends = [0, *(k + 1 for k, joint in enumerate(joints) if joint.stops), len(spans)]
+    parts = []
+    for first, last in pairwise(ends):
+        ratios = [joints[k].ratio for k in range(first, last - 1)]
+        units = np.cumprod([1.0, *ratios]).tolist()
+        halts = (first > 0 and joints[first - 1].corner, last < len(spans) and joints[last - 1].corner)
+        halts = (halts[0] and not spans[first].rests[0], halts[1] and not spans[last - 1].rests[1])
+        parts.append(Part(tuple(spans[first:last]), tuple(units), halts))
+    if len(parts) == 1 and _is_closed(plan):
+        return [replace(parts[0], halts=(False, False), closed=True)]
+    if spans[0].moves and spans[-1].moves and _is_closed(plan):  # the last part leads into the first
+        begin, end = parts[0], parts.pop()
+        units = (*end.units, *(end.units[-1] * unit for unit in begin.units))
+        parts[0] = Part(end.spans + begin.spans, units, (end.halts[0], begin.halts[1]))
+    return parts
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """Point between two spans.
+
+    Attributes
+    ----------
+    stops : bool
+        Whether the plan is at rest or must stop there.
+    corner : bool
+        Whether it must stop because the direction changes.
+    ratio : float
+        Speed before the point relative to that after it.
+    """
+
+    stops: bool
+    corner: bool
+    ratio: float
+
+
+def _joint(before: Array, after: Array, still: Array, stops: bool = True) -> _Joint:
+    """Kind of a point, by the jets (3, naxes) on both sides, and velocities and accelerations that are 0."""
+    rests = [bool((np.abs(jet[1]) <= still[0]).all()) for jet in (before, after)]
+    if all(rests):
+        # A reversal with acceleration is passed without a break.
+        passes = (np.abs(after[2] - before[2]) <= 1e3 * still[1]).all() and (np.abs(after[2]) > 1e3 * still[1]).any()
+        return _Joint(not passes, False, 1.0)
+    moving = still[0] > 0.0
+    tangents = [jet[1, moving] / still[0, moving] for jet in (before, after)]
+    sizes = [float(np.linalg.norm(tangent)) for tangent in tangents]
+    if any(rests) or (np.abs(tangents[0] / sizes[0] - tangents[1] / sizes[1]) > 1e-7).any():
+        return _Joint(stops, stops, 1.0)
+    return _Joint(False, False, sizes[0] / sizes[1] if abs(sizes[0] / sizes[1] - 1.0) > 1e-12 else 1.0)
+
+
+def _spans(plan: Trajectory, stops: bool) -> tuple[list[Span], list[_Joint]]:
+    """Spans between breakpoints and waypoints, and the points between them."""
+    segments, starts, ends = [], [], []
+    inner = np.array([waypoint.time for waypoint in plan.waypoints])
+    for segment, (left, right) in enumerate(pairwise(plan.breakpoints.tolist())):
+        slack = 1e-9 * (right - left)
+        edges = [0.0, *(inner[(inner > left + slack) & (inner < right - slack)] - left).tolist(), right - left]
+        for first, last in pairwise(edges):
+            segments.append(segment)
+            starts.append(first)
+            ends.append(last)
+    fractions = np.array([0.0, _NEAR, 2.0 * _NEAR, 0.21, 0.5, 0.79, 1.0 - 2.0 * _NEAR, 1.0 - _NEAR, 1.0])
+    times = np.array(starts)[:, None] + (np.array(ends) - np.array(starts))[:, None] * fractions
+    jets = plan.segments_jet(np.repeat(segments, fractions.size), times.ravel(), 2)
+    jets = jets.reshape(3, plan.naxes, len(segments), fractions.size)
+    still = _STILL * np.abs(jets[1:]).max(axis=(2, 3))
+    moves = (np.abs(jets[1]) > still[0, :, None, None]).any(axis=(0, 2))
+    rests = _powers(jets[1] / np.where(still[0] > 0.0, still[0], 1.0)[:, None, None])
+    spans = [
+        Span(segment, first, last, bool(moving), (own[0], own[1]))
+        for segment, first, last, moving, own in zip(segments, starts, ends, moves, rests, strict=True)
+    ]
+    joints = [
+        _joint(jets[:, :, k, -1], jets[:, :, k + 1, 0], still, stops)
+        if spans[k].moves and spans[k + 1].moves
+        else _Joint(True, stops, 1.0)
+        for k in range(len(spans) - 1)
+    ]
+    return spans, joints
+
+
+def _powers(velocities: Array) -> list[list[float]]:
+    """Powers (nspans, 2) with which velocities (naxes, nspans, npoints), of 1 at rest, grow from both ends."""
+    sizes = np.linalg.norm(velocities, axis=0)
+    rests = (np.abs(velocities[:, :, [0, -1]]) <= 1.0).all(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        powers = np.log2(sizes[:, [2, -3]] / sizes[:, [1, -2]])
+    return np.where(rests & np.isfinite(powers), np.clip(powers, 1.0, None), 0.0).tolist()
+
+
+def _is_closed(plan: Trajectory) -> bool:
+    """Whether the end of a plan is continued by its start, in motion or with acceleration."""
+    first, last = plan.jet(plan.start, 2), plan.jet(plan.end, 2, left=True)
+    extrema = plan.extrema()
+    slack = 1e-9 * (extrema.maximum - extrema.minimum) + 1e-14 * np.abs(first[0])
+    if (np.abs(last[0] - first[0]) > slack).any():
+        return False
+    joint = _joint(last, first, _STILL * np.stack([plan.peak(1), plan.peak(2)]))
+    return not joint.stops and abs(joint.ratio - 1.0) <= 1e-7

@@ -1,0 +1,273 @@
+"""Fastest time law on a path: against closed forms, and linear programs on a fine grid."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from repetitions import examples, one_in
+from scipy.optimize import linprog
+from scipy.sparse import coo_array
+
+import ctrlplan as cp
+from ctrlplan import PiecewiseSpline, PolySpline, TrigSpline, Waypoint, fastest
+from ctrlplan.trajectories import Retimed, TimeLaw
+
+COUNT = 40_001
+
+
+def random_path(count, naxes, seed):
+    """Minimum-jerk spline from rest to rest through random points."""
+    points = np.random.default_rng(seed).normal(size=(naxes, count))
+    times = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points), axis=0)))
+    rest = np.full(count, np.nan)
+    rest[[0, -1]] = 0.0
+    return PiecewiseSpline.from_arrays(times, points, derivatives={1: rest, 2: rest}, warn=False)
+
+
+def line(count):
+    """Straight line from 0 to 1 through equally spaced waypoints."""
+    rest = np.full(count, np.nan)
+    rest[[0, -1]] = 0.0
+    places = np.linspace(0.0, 1.0, count)
+    return PiecewiseSpline.from_arrays(places, places, derivatives={1: rest, 2: rest})
+
+
+def optimum(plan, velocity, acceleration, count=600):
+    """Duration by linear programs: b is piecewise linear, and limits hold at the middle of each interval.
+
+    At points of rest the grid is fine. Each program minimises the duration that is
+    linearised at the last solution, within a factor of 2 of it.
+    """
+    u = np.linspace(0.0, 1.0, count + 1)
+    s = plan.start + plan.duration * (u**3 * (10 - 15 * u + 6 * u**2))
+    h, (first, second) = np.diff(s), plan.jet(0.5 * (s[1:] + s[:-1]), 2)[1:]
+    rows = []
+    for slope, curvature in zip(first, second, strict=True):
+        pair = np.stack([0.5 * curvature - 0.5 * slope / h, 0.5 * curvature + 0.5 * slope / h]) / acceleration
+        rows += [pair, -pair, 0.5 * np.stack([slope**2, slope**2]) / velocity**2]
+    k = np.arange(count)
+    values = np.concatenate([pair.ravel() for pair in rows])
+    place = np.concatenate([np.tile(k + j * count, 2) for j in range(len(rows))])
+    column = np.tile(np.concatenate([k, k + 1]), len(rows))
+    matrix = coo_array((values, (place, column)), shape=(len(rows) * count, count + 1)).tocsr()
+    b = np.full(count + 1, 1.0 / max(float((matrix @ np.ones(count + 1)).max()), 1e-9))
+    last = math.inf
+    for _ in range(60):
+        middle = 0.5 * (b[1:] + b[:-1])
+        weights = np.zeros(count + 1)
+        weights[:-1] -= 0.25 * h * middle**-1.5
+        weights[1:] -= 0.25 * h * middle**-1.5
+        found = linprog(weights * b, matrix * b[None, :], np.ones(matrix.shape[0]), bounds=(0.5, 2.0), method="highs")
+        b = b * found.x
+        duration = float((2.0 * h / (np.sqrt(b[1:]) + np.sqrt(b[:-1]))).sum())
+        if duration > last * (1.0 - 1e-5):
+            return duration
+        last = duration
+    raise AssertionError("the programs do not converge")
+
+
+def check_limits(plan, limits):
+    """Velocities and accelerations at many times."""
+    jet = np.abs(plan.jet(np.linspace(plan.start, plan.end, COUNT), 2)).max(axis=(1, 2))
+    for order, name in ((1, "velocity"), (2, "acceleration")):
+        if name in limits:
+            assert jet[order] <= limits[name] * (1 + 1e-11)
+
+
+LIMITS = {"velocity": 2.0, "acceleration": 4.0}
+
+
+@pytest.mark.parametrize(("count", "naxes"), [(3, 2), (6, 3), pytest.param(12, 7, marks=pytest.mark.slow)])
+def test_the_duration_is_the_minimum(count, naxes):
+    plan = random_path(count, naxes, 1)
+    found = fastest(plan, LIMITS, hold="path")
+    best = optimum(plan, 2.0, 4.0)
+    assert 0.997 * best <= found.duration <= 1.004 * best  # the grid of the program is not exact either
+    check_limits(found.plan, LIMITS)
+    assert found.active.fraction == pytest.approx(0.0, abs=1e-9)
+    assert found.margins.satisfied
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("count", "naxes"), [(2, 2), (20, 2), (50, 3)])
+def test_limits_are_satisfied_on_random_paths(count, naxes, seed):
+    plan = random_path(count, naxes, seed)
+    found = fastest(plan, LIMITS, hold="path")
+    check_limits(found.plan, LIMITS)
+    assert found.duration < 0.9 * fastest(plan, LIMITS).duration
+    assert found.active.fraction == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("count", one_in(2, [2, 3, 5, 10, 25, 50]))
+def test_waypoints_on_a_straight_line_do_not_matter(count):
+    found = fastest(line(count), {"y_d1": 10.0, "y_d2": 1.0}, hold="path")
+    assert 2.0 <= found.duration <= 2.0 * 1.003
+    check_limits(found.plan, {"velocity": 10.0, "acceleration": 1.0})
+
+
+def test_the_path_is_the_same_and_the_law_is_smooth():
+    plan = random_path(5, 2, 3)
+    found = fastest(plan, LIMITS, hold="path").plan
+    assert isinstance(found, Retimed)
+    assert isinstance(found.law, TimeLaw)
+    passed = found.law(np.linspace(found.start, found.end, 2001))
+    assert (np.diff(passed) > 0.0).all()
+    np.testing.assert_allclose(found(np.linspace(found.start, found.end, 2001)), plan(passed), atol=1e-12)
+    inner = found.law.breakpoints[1:-1]
+    right, left = found.law.jet(inner, 3)[:, 0], found.law.jet(inner, 3, left=True)[:, 0]
+    rounding = 2 * np.spacing(found.end) * (np.abs(right) + np.abs(left))[1:]  # of the breakpoints
+    assert (np.abs(right - left)[:3] <= rounding + 1e-13 * np.abs(right[:3]).max(axis=1, keepdims=True)).all()
+    assert found.jumps(2) == ()
+
+
+def test_different_limits_by_axis_and_by_sign():
+    plan = random_path(5, 2, 4)
+    limits = {"y1_d1": 1.0, "y2_d1": (-3.0, 0.5), "y1_d2": (-1.0, 6.0), "y2_d2": (None, 2.0)}
+    found = fastest(plan, limits, hold="path")
+    jet = found.plan.jet(np.linspace(found.plan.start, found.plan.end, COUNT), 2)
+    high = np.array([[1.0, 0.5], [6.0, 2.0]])
+    low = np.array([[-1.0, -3.0], [-1.0, -np.inf]])
+    assert (jet[1:].max(axis=2) <= high * (1 + 1e-11)).all()
+    assert (jet[1:].min(axis=2) >= low * (1 + 1e-11)).all()
+    # Exchanging the signs of an axis and of its limits changes nothing.
+    mirrored = cp.stack([plan.select("y1"), -1.0 * plan.select("y2")])
+    other = fastest(mirrored, limits | {"y2_d1": (-0.5, 3.0), "y2_d2": (-2.0, None)}, hold="path")
+    assert other.duration == pytest.approx(found.duration, rel=1e-6)
+
+
+def test_one_direction_without_velocity():
+    """A limit of 0 on the side to which the plan does not move."""
+    plan = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 10, 0, 0)])
+    found = fastest(plan, {"y_d1": (0.0, 1.0), "y_d2": 0.5}, hold="path")
+    assert 12.0 <= found.duration <= 12.0 * 1.004
+    back = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 10, 0, 0), Waypoint(3, 5, 0, 0)])
+    with pytest.raises(ValueError, match="limits must be satisfied for some duration, got y_d1 of both signs"):
+        fastest(back, {"y_d1": (0.0, 1.0), "y_d2": 0.5}, hold="path")
+
+
+# Stops, corners and dwells
+
+REST = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]
+MOVE, MOVE_ON = PolySpline(REST), PolySpline([Waypoint(0, 1, 0, 0), Waypoint(1, 2, 0, 0)])
+
+
+def test_a_dwell_keeps_its_duration():
+    plan = MOVE.then(PolySpline([Waypoint(0, 1, 0, 0), Waypoint(2.5, 1, 0, 0)])).then(MOVE_ON)
+    found = fastest(plan, {"velocity": 10.0, "acceleration": 1.0}, hold="path")
+    assert 6.5 <= found.duration <= 6.5 * 1.003
+    still = [t for t in np.linspace(found.plan.start, found.plan.end, 1001) if not found.plan(t, 1)]
+    assert max(still[1:-1]) - min(still[1:-1]) == pytest.approx(2.5, abs=0.02)
+    assert found.stops == ()
+
+
+@pytest.mark.parametrize("kind", ["joined", "waypoint", "piecewise"])
+def test_a_stop_inside_remains(kind):
+    points = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0), Waypoint(2, 2, 0, 0)]
+    plan = {
+        "joined": MOVE.then(PolySpline([points[1], points[2]])),
+        "waypoint": PolySpline(points),
+        "piecewise": PiecewiseSpline(points),
+    }[kind]
+    found = fastest(plan, {"velocity": 10.0, "acceleration": 1.0}, hold="path")
+    assert 4.0 <= found.duration <= 4.0 * 1.003
+    check_limits(found.plan, {"velocity": 10.0, "acceleration": 1.0})
+    middle = found.plan.law.moments(np.array([1.0]))[0]
+    assert abs(found.plan(middle, 1)) < 1e-9
+    assert found.stops == ()
+
+
+def test_the_plan_stops_at_corners_of_the_path_and_says_so():
+    """From the full speed to a stop, from stop to stop, and to the full speed: sqrt(2) + 2 + sqrt(2)."""
+    plan = PiecewiseSpline([Waypoint(0, [0, 0]), Waypoint(1, [1, 0]), Waypoint(2, [1, 1]), Waypoint(3, [0, 1])])
+    found = fastest(plan, {"velocity": 10.0, "acceleration": 1.0}, hold="path")
+    best = 2.0 + 2.0 * math.sqrt(2.0)
+    assert best <= found.duration <= 1.003 * best
+    assert found.stops == (1.0, 2.0)
+    assert "stops at corners of the path at 1 s of the given plan, at 2 s of the given plan" in " ".join(
+        str(found).split()
+    )
+    check_limits(found.plan, {"velocity": 10.0, "acceleration": 1.0})
+    assert {jump.time for jump in found.plan.jumps(1)} <= {found.plan.start, found.plan.end}
+
+
+def test_a_corner_is_passed_if_accelerations_are_not_limited():
+    plan = PiecewiseSpline([Waypoint(0, [0, 0]), Waypoint(1, [3, 0]), Waypoint(2, [3, 4])])
+    found = fastest(plan, {"velocity": 2.0}, hold="path")
+    assert found.duration == pytest.approx(3.5, rel=0.02)
+    assert found.stops == ()
+
+
+def test_a_change_of_the_plans_speed_on_a_straight_line_is_no_corner():
+    plan = PiecewiseSpline([Waypoint(0, [0, 0]), Waypoint(1, [1, 1]), Waypoint(5, [2, 2]), Waypoint(6, [4, 4])])
+    found = fastest(plan, {"velocity": 10.0, "acceleration": 1.0}, hold="path")
+    assert found.duration == pytest.approx(0.4, rel=1e-3)
+    assert found.stops == ()
+    assert {jump.time for jump in found.plan.jumps(1)} <= {found.plan.start, found.plan.end}
+
+
+def test_a_plan_that_jumps_is_rejected():
+    plan = MOVE.then(cp.Step(3.0, 1.0)).then(PolySpline([Waypoint(0, 3, 0, 0), Waypoint(1, 4, 0, 0)]))
+    with pytest.raises(ValueError, match="plan must be continuous, got y that jumps by 2 at 1 s"):
+        fastest(plan, {"velocity": 1.0}, hold="path")
+
+
+def test_limits_that_do_not_bound_the_speed_are_rejected():
+    plan = PolySpline([Waypoint(0, 0, 1.0), Waypoint(1, 1, 1.0)])
+    with pytest.raises(ValueError, match="limits must bound the speed along the whole path"):
+        fastest(plan, {"acceleration": 1.0}, hold="path")
+
+
+# Closed paths and start times
+
+CYCLE = TrigSpline.cyclic([Waypoint(0, [0, 0]), Waypoint(1, [3, 0]), Waypoint(2, [1, 2])], 3.0)
+
+
+def begun_later(plan, delay):
+    """Closed plan that begins at another of its points."""
+    return cp.Clipped(plan.then(plan), plan.start + delay, plan.end + delay)
+
+
+def test_the_start_of_a_closed_path_does_not_matter():
+    found = [fastest(plan, LIMITS, hold="path") for plan in (CYCLE, begun_later(CYCLE, 0.7), begun_later(CYCLE, 2.1))]
+    durations = [one.duration for one in found]
+    assert max(durations) <= 1.004 * min(durations)
+    # Twice around with the same speed at the end and the start.
+    twice = fastest(CYCLE.then(CYCLE), LIMITS, hold="path").duration
+    assert twice == pytest.approx(2.0 * durations[0], rel=0.004)
+
+
+@pytest.mark.parametrize("start", [1e5, 1.7e9])
+def test_the_start_time_does_not_matter(start):
+    plan = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(3, 1, 0, 0)])
+    limits = {"velocity": 1.0, "acceleration": 1.0}
+    found, early = (fastest(one, limits, hold="path") for one in (plan.shift(start), plan))
+    assert found.duration == pytest.approx(early.duration, abs=8 * np.spacing(start))
+    assert found.plan.start == start
+    assert found.margins.satisfied
+
+
+@pytest.mark.slow
+@examples(8)
+@given(size=st.floats(1e-6, 1e6), duration=st.floats(1e-6, 1e6))
+def test_units_do_not_matter(size, duration):
+    plan = (size * random_path(4, 2, 5)).retime(duration)
+    found = fastest(plan, {"velocity": size * 2.0, "acceleration": size * 4.0}, hold="path")
+    expected = fastest(random_path(4, 2, 5), LIMITS, hold="path").duration
+    assert found.duration == pytest.approx(expected, rel=1e-6)
+
+
+def test_an_interval_of_durations():
+    plan = random_path(4, 2, 5)
+    shortest = fastest(plan, LIMITS, hold="path").duration
+    longer = fastest(plan, LIMITS, hold="path", durations=(2.0 * shortest, 9.0 * shortest))
+    assert longer.duration == pytest.approx(2.0 * shortest, rel=1e-12)
+    with pytest.raises(ValueError, match=r"limits must be satisfied for some duration from .* got a minimum of"):
+        fastest(plan, LIMITS, hold="path", durations=(0.1, 0.9 * shortest))
+
+
+def test_positions_that_violate_their_limits_are_rejected():
+    with pytest.raises(ValueError, match="limits must be satisfied at rest"):
+        fastest(MOVE, {"y": (0.0, 0.9), "velocity": 1.0}, hold="path")
