@@ -48,6 +48,7 @@ ARGUMENTS = {
     "coefficients": lambda: [[[0.5, -1.0], [1 / 3, 2.0]], [[2.0, 0.0], [-1.0, 1.0]], [[1.0, -3.0], [2.0, 0.7]]],
     "values": lambda: [[1.0, -3.0], [0.5, 0.0]],
     "start_state": lambda: [[1.0, 2.0], [0.5, -1.0], [0.1, 0.0]],
+    "count": lambda: 3,
     "law": lambda: trajectories.PolySpline([Waypoint(3.0, -1.0, 0.7), Waypoint(4.0, 0.1), Waypoint(7.5, 2.0, 0.3)]),
 }
 
@@ -72,6 +73,8 @@ def build(kind):
         if parameter.default is inspect.Parameter.empty and name not in given:
             assert name in ARGUMENTS, f"say in ARGUMENTS what the argument {name} of {kind.__name__} may be"
             given[name] = ARGUMENTS[name]()
+    if kind is trajectories.Repeated:  # of a plan that returns to its first position
+        given["plan"] = trajectories.PiecewiseSpline([*POINTS, Waypoint.from_jets(2.5, x=[0.0, 1.0], z=[1.0])])
     return kind(**given, labels=["p", "q", "r", "s"]) if kind is trajectories.Stacked else kind(**given)
 
 
