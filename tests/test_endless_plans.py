@@ -17,7 +17,6 @@ POINTS = [(0.4, 2.0), (0.7, 10.0), (1.2, 10.0), (1.5, 5.0), (1.8, 1.0)]
 PERIOD = cp.PiecewiseSpline.cyclic([cp.Waypoint(0, 0, 0, 0), *(cp.Waypoint(t, y) for t, y in POINTS)], 2.0)
 ENDLESS, LONG = PERIOD.repeat(None), PERIOD.repeat(20)
 MOVE = cp.PolySpline([cp.Waypoint(-1, -3, 0, 0), cp.Waypoint(0, 0, 0, 0)])
-PLANE = cp.stack([PERIOD, 0.5 * PERIOD], labels=["x", "z"])
 TIMES = np.linspace(0.0, 9.0, 181)
 LAG = ct.tf([4.0], [1.0, 4.0], inputs="y", outputs="v", name="lag")
 LOOP = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
@@ -132,6 +131,7 @@ REJECTED = {
     "residual_plot": lambda plan: cp.residual_plot(plan, [1.0]),
     "Retimed": lambda plan: cp.Retimed(plan, cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 2)])),
     "Retimed, law": lambda plan: cp.Retimed(PERIOD, plan),
+    "PathPlan": lambda plan: cp.PathPlan([cp.PolySpline([cp.Waypoint(0, [0, 0]), cp.Waypoint(1, [1, 0])])], [1], plan),
     "create_replanner_iosystem": lambda plan: cp.create_replanner_iosystem(plan, 0.1),
     "flat_loop, TVLQR": lambda plan: cp.flat_loop(MOTOR, plan, law=cp.TVLQR(np.eye(2), [[1.0]])),
     "then": lambda plan: plan.then(MOVE),
