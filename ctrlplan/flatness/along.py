@@ -16,6 +16,7 @@ from ctrlplan._types import Array
 from ctrlplan.flatness.maps import FlatMaps, SingularError, inverses
 from ctrlplan.flatness.rest import ADVICE, note_of_rest
 from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories.trajectory import check_end
 
 _INTERVALS = 48
 """Intervals of the first grid."""
@@ -99,6 +100,7 @@ def grid_of(maps: FlatMaps, plan: Trajectory, p: Array, start: Array | None, nam
     ValueError
         With the time and the state that the flat outputs do not determine.
     """
+    check_end(plan)
     first, last = float(plan.start), float(plan.end)
     if last <= first:  # a plan at rest
         last = first + 1.0

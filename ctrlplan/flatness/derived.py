@@ -18,10 +18,15 @@ from ctrlplan.flatness.maps import SINGULAR, FlatMaps, regularity
 from ctrlplan.flatness.on_path import FORWARD, CurveMap
 from ctrlplan.flatness.system import FlatSystem
 from ctrlplan.symbolic.tape import Tape
-from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories import Repeated, Trajectory
+from ctrlplan.trajectories.trajectory import check_end
 
 if TYPE_CHECKING:
     from ctrlplan.flatness.analysis import Analysis
+
+
+_PERIODIC = 1e-6
+"""Difference of states one period apart, relative to their size, that is attributed to rounding."""
 
 
 class DerivedFlatSystem(FlatSystem):
@@ -120,6 +125,7 @@ class DerivedFlatSystem(FlatSystem):
         map by formulas would need another branch (a car that turns round). The
         result does not depend on the other times of a call.
         """
+        plan, times = self._folded(plan, times)
         p = self.parameter_values()
         first = None if start is None else self._extended(start, plan, p)
         jet = plan.jet(times, max(self.orders))
@@ -157,7 +163,7 @@ class DerivedFlatSystem(FlatSystem):
 
     def extension_along(self, plan: Trajectory, time: float) -> Array:
         """States of the extension (extension,) at a time of a plan."""
-        plan, times = self._along(plan, time, None)
+        plan, times = self._folded(*self._along(plan, time, None))
         p, jet = self.parameter_values(), plan.jet(times.ravel(), max(self.orders))
         z, u = states_along(self.maps, self._grid(plan, p, None), jet, times.ravel(), p, str(self.name))
         self._check_determined(z[: self.maps.nstates], u, plan, times.ravel())
@@ -201,6 +207,21 @@ class DerivedFlatSystem(FlatSystem):
         u = np.where(on_branch(self.maps, x, u, p), u, np.nan)
         outputs = np.broadcast_to(self._outputs(x, u, p[:, None]), (len(self.output_labels), x.shape[1]))
         return dict(zip(self.output_labels, outputs, strict=True)) | super().signals(x, u)
+
+    def _folded(self, plan: Trajectory, times: Array) -> tuple[Trajectory, Array]:
+        """Plan with an end, and times; of one that repeats for all future times, its first pass.
+
+        The states along the repeated part must be periodic.
+        """
+        if not isinstance(plan, Repeated) or plan.count is not None:
+            return plan, times
+        ends, p = np.array([plan.since, plan.plan.end]), self.parameter_values()
+        jet, grid = plan.plan.jet(ends, max(self.orders)), self._grid(plan.plan, p, None)
+        z = states_along(self.maps, grid, jet, ends, p, str(self.name))[0]
+        apart = np.abs(z[:, 1] - z[:, 0])
+        if not (apart <= _PERIODIC * (np.abs(z).max(axis=1) + self.maps.scales[: len(z)])).all():
+            check_end(plan, f"a plan along which states of {self.name} are not periodic")
+        return plan.plan, plan.first_pass(times.ravel()).reshape(times.shape)
 
     def _grid(self, plan: Trajectory, p: Array, start: Array | None) -> Grid:
         """Grid of a plan, kept for the next call."""

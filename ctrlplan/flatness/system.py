@@ -26,6 +26,7 @@ from ctrlplan.flatness.on_path import (
 from ctrlplan.flatness.rest import ADVICE, note_of_rest, time_of_rest
 from ctrlplan.flatness.verify import checked_plant, random_probes, undetermined_at_rest
 from ctrlplan.trajectories import PathPlan, Trajectory
+from ctrlplan.trajectories.repeated import jumps_until
 
 if TYPE_CHECKING:
     from ctrlplan.flatness.derived import DerivedFlatSystem
@@ -356,7 +357,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
     def _check_smooth(self, plan: Trajectory, first: float, last: float) -> None:
         """Raise if a derivative below r_j jumps between two times."""
         order_of = dict(zip(plan.labels, self.orders, strict=True))
-        for jump in plan.jumps(max(self.orders) - 1):
+        for jump in jumps_until(plan, max(self.orders) - 1, first, last):
             # At inner breakpoints and the start the value is the right limit, at the end the left limit.
             between = first <= jump.time < last if jump.time == plan.end else first < jump.time <= last
             if between and jump.order < order_of[jump.label]:

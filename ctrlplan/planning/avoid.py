@@ -25,6 +25,7 @@ from ctrlplan.planning.objectives import plan_length
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import PiecewiseSpline, Trajectory, Waypoint, WaypointSpline
 from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.trajectory import check_end
 from ctrlplan.trajectories.waypoint import waypoint_table
 
 Build = Callable[[Iterable[Waypoint]], Trajectory]
@@ -309,6 +310,7 @@ def _roughness(t: Array, jet: Array, size: float) -> Array:
 
 def _checked_plan(plan: Trajectory) -> Trajectory:
     check_kind(plan, "plan", Trajectory)
+    check_end(plan)
     if plan.naxes != 2:
         raise ValueError(f"a plan among obstacles must have two axes, got {plan.naxes}")
     if not plan.duration:

@@ -15,6 +15,7 @@ from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.repeated import one_pass
 
 _TIGHT = 1e-6  # relative gap between the bound and the attained minimum, unless a clearance is required
 _ROUNDING = 1e-9  # of the coordinates: a plan at rest at exactly the required clearance is certified
@@ -156,6 +157,7 @@ def clearance(
     checked_rope(rope)
     if plan.naxes != 2:
         raise ValueError(f"a plan among obstacles must have two axes, got {plan.naxes}")
+    plan = one_pass(plan)
     if not plan.duration:
         raise ValueError("a trajectory must have a duration for its clearance, got a step")
     cells = _Cells(plan, things, radius, rope)

@@ -20,6 +20,7 @@ from ctrlplan.planning.window import mean_square, window
 from ctrlplan.trajectories import PathPlan, Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.extrema import Extrema, function_extrema
+from ctrlplan.trajectories.trajectory import check_end
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -310,6 +311,7 @@ class Limited:
     ) -> None:
         if not isinstance(plan, Trajectory):
             raise TypeError(f"plan must be a Trajectory (the attribute plan of a result), got {plan!r:.60}")
+        check_end(plan)
         if not plan.duration:
             raise ValueError("a plan under limits must have a duration, got a step")
         check_kind(limits, "limits", Mapping, "a mapping of names to limits")

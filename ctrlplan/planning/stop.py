@@ -18,6 +18,7 @@ from ctrlplan.planning.path_stop import stopped_on_path
 from ctrlplan.trajectories import Clipped, Joined, MotionProfile, Step, Trajectory
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.motion_profile import profile_of_phases
+from ctrlplan.trajectories.repeated import covering
 from ctrlplan.trajectories.velocity_change import velocity_changes
 from ctrlplan.trajectories.waypoint import ENTRIES
 
@@ -56,6 +57,7 @@ def stopped(
     if synchronize not in (*get_args(Synchronize), None):
         raise ValueError(f'synchronize must be "time", "path" or None, got {synchronize!r}')
     moment = checked_moment(plan, time)
+    plan = covering(plan, moment)
     within = stop_limits(plan, limits)
     state = state_at(plan, moment)
     if not state[1:].any():
@@ -80,6 +82,7 @@ def at_velocity(
     if synchronize not in ("time", None):
         raise ValueError(f'synchronize must be "time" or None for a change to a velocity, got {synchronize!r}')
     moment = checked_moment(plan, time)
+    plan = covering(plan, moment)
     within = stop_limits(plan, limits)
     state, final = state_at(plan, moment), np.zeros((3, plan.naxes))
     final[1] = checked_vector(velocity, "velocity", plan.naxes)

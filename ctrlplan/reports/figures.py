@@ -40,6 +40,7 @@ from ctrlplan.studies.sections import Curves, Place
 from ctrlplan.studies.sweep import Sweep, settling_jumps
 from ctrlplan.studies.units import in_units, output_unit, superscript
 from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories.repeated import one_pass
 
 Array = NDArray[np.float64]
 
@@ -507,6 +508,7 @@ def _arrow(axes: Axes, source: tuple[float, float], sink: tuple[float, float], t
 
 def _times(plan: Trajectory, start: float | None = None, end: float | None = None) -> Array:
     """Times to draw a trajectory: dense, beyond its ends, and on both sides of every breakpoint."""
+    plan = one_pass(plan)
     first, last = plan.start if start is None else start, plan.end if end is None else end
     margin = 0.06 * (last - first) or 0.5
     t = np.linspace(first - margin, last + margin, 1001)

@@ -198,7 +198,7 @@ class LinearSteps:
         """The same for many steps, from their response that starts at zero."""
         flow, n = self._flow, self._n
         times = np.array([self._grid.time(self.count + k) for k in range(self._length + 1)])
-        breakpoints = [t for plan, _ in self._plans for t in plan.breakpoints]
+        breakpoints = [t for plan, _ in self._plans for t in plan.breakpoints_between(times[0], times[-1])]
         states = exact_states(flow.a, flow.b[:, self._m :], jet_of(self._plans), breakpoints, times, np.zeros(n))
         change = states[:, 1:] - states[:, :-1] - self._change[:, :n] @ states[:, :-1]
         outputs = flow.c @ change + flow.d[:, self._m :] @ signal_values(self._signals, times[1:])
@@ -289,7 +289,7 @@ class SampledSteps:
         moved = x + change @ np.concatenate([x, u])
         if self._plans:
             times = np.array([float(left), float(right)])
-            marks = [t for plan, _ in self._plans for t in plan.breakpoints]
+            marks = [t for plan, _ in self._plans for t in plan.breakpoints_between(times[0], times[1])]
             start = np.zeros(x.size)
             moved += exact_states(flow.a, flow.b[:, self._m :], jet_of(self._plans), marks, times, start)[:, 1]
         return np.asarray(moved)
@@ -368,13 +368,14 @@ class NumericalSteps:
         self._form = self._compiled()
         self._solver = ScaledSolver(self._made, state)
         self._course = Course(network, self._solver, self._signals, (grid.time(0), grid.time(1)), 10.0 * rtol)
-        plans = sorted({t for t in breakpoints_of(self._signals) if math.isfinite(t)})
-        if plans:
-            self._course.add_rounding(np.union1d(np.linspace(plans[0], plans[-1], 257), plans))
+        plans = [signal.plan.breakpoints for signal in self._signals if isinstance(signal, PlanSignal)]
+        if plans:  # of a plan that repeats for all future times, one period
+            times = np.unique(np.concatenate(plans))
+            self._course.add_rounding(np.union1d(np.linspace(times[0], times[-1], 257), times))
         endless = self._equations is not None and network.delays_feed_delays(self._equations.feeds)
         delays = [network.blocks[i].delay or 0.0 for i in network.blocks_with("delay")]
         self._jumps = Jumps(delays, math.inf if endless else _HOPS)
-        self._jumps.add([t for t in (grid.time(0), *plans, *network.breakpoints) if t >= grid.time(0)])
+        self._jumps.add([t for t in (grid.time(0), *network.breakpoints) if t >= grid.time(0)])
 
     @property
     def state(self) -> Array:
@@ -414,6 +415,7 @@ class NumericalSteps:
         if not np.array_equal(u, self._held.value):
             self._held.value = u
             self._jumps.add([left])
+        self._jumps.add(breakpoints_of(self._signals, left, right))
         self._solver.begin(left, right, lambda t: known_before(self._signals, t), self._network.breakpoints)
         marks = [t for t in self._jumps.until(right) if t > left] + self._solver.instants
         run = integrate(
@@ -553,7 +555,11 @@ class HeldSignal:
     """Inputs that are constant over a step."""
 
     def __init__(self, value: Array) -> None:
-        self.value, self.width, self.breakpoints = value, value.size, np.empty(0)
+        self.value, self.width = value, value.size
+
+    def breakpoints_between(self, t0: float, t1: float) -> Array:
+        """None."""
+        return np.empty(0)
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values (ninputs, ntime)."""

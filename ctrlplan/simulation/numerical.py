@@ -327,7 +327,7 @@ class Attempt(Generic[S]):
         """Tolerances of a step for which the accumulated errors stay within the tolerances of the run."""
         job, network = self.job, self.job.blocks
         first, last = job.first, float(job.times[-1])
-        marks = {t for t in (*breakpoints_of(self.time_signals), *network.breakpoints) if first < t < last}
+        marks = {t for t in (*breakpoints_of(self.time_signals, first, last), *network.breakpoints) if first < t < last}
         samples = sum((last - first) / float(network.blocks[i].period or 1.0) for i in network.blocks_with("period"))
         return Tolerances.of_run(job.rtol, self.scales, len(marks) + int(samples), self.tighter)
 

@@ -79,7 +79,6 @@ class DelayedSignal:
 
     def __init__(self, delay: float, initial: Array, first: float) -> None:
         self.delay, self.width = delay, initial.size
-        self.breakpoints = np.empty(0)
         self.tolerance = 0.0
         self._initial, self._first = initial, first
         self._pieces: list[Series] = []
@@ -103,6 +102,10 @@ class DelayedSignal:
         """Remove the pieces that are not read after a time."""
         old = bisect_right(self._ends, now - self.delay - self.tolerance)
         del self._pieces[:old], self._ends[:old]
+
+    def breakpoints_between(self, t0: float, t1: float) -> Array:
+        """None: segments end at the breakpoints of what is delayed, after the delay."""
+        return np.empty(0)
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Stored values; segments end at their breakpoints."""
@@ -302,7 +305,7 @@ def _new_course(
     """Course of a run that continues none."""
     course = Course(network, solver, time_signals, span, resolution)
     endless = equations is not None and network.delays_feed_delays(equations.feeds)
-    everything = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
+    everything = [*breakpoints_of(time_signals, *span), *network.breakpoints, *marks]
     course.prolong(_fixed(everything, *span, course.memory.delays, _MARKS if endless else _HOPS), *span)
     course.add_rounding(np.union1d(np.linspace(*span, 257), course.schedule.marks))
     return course
@@ -513,11 +516,11 @@ class SampleTimes:
 def values_after(time_signals: Sequence[TimeSignal], t: float, tolerance: float) -> Array:
     """Signals (nsignals,) at a time, after a breakpoint that differs from it by rounding."""
 
-    def moment(marks: Array) -> float:
-        k = int(np.searchsorted(marks, t))
-        return float(marks[k]) if k < len(marks) and marks[k] - t <= tolerance else t
+    def moment(signal: TimeSignal) -> Array:
+        near = signal.breakpoints_between(t, float(np.nextafter(t + tolerance, np.inf)))
+        return near[:1] if near.size else np.array([t])
 
-    seen = [signal.at(np.array([moment(signal.breakpoints)])) for signal in time_signals]
+    seen = [signal.at(moment(signal)) for signal in time_signals]
     return np.asarray(np.concatenate([np.zeros((0, 1)), *seen])[:, 0])
 
 

@@ -92,9 +92,8 @@ class Series:
 class TimeSignal(Protocol):
     """Signals that are functions of time, analytic between breakpoints."""
 
-    @property
-    def breakpoints(self) -> Array:
-        """Times at which they are not analytic [s]."""
+    def breakpoints_between(self, t0: float, t1: float) -> Array:
+        """Times [s] in [t0, t1) at which they are not analytic."""
 
     @property
     def width(self) -> int:
@@ -120,10 +119,9 @@ class PlanSignal:
     plan: Trajectory
     derivatives: int = 0
 
-    @property
-    def breakpoints(self) -> Array:
+    def breakpoints_between(self, t0: float, t1: float) -> Array:
         """Breakpoints of the plan."""
-        return self.plan.breakpoints
+        return self.plan.breakpoints_between(t0, t1)
 
     @property
     def width(self) -> int:
@@ -153,7 +151,11 @@ class SampledSignal:
         self.times, self.values = times, values
         self._ends = _ends_of_lines(times, values)
         self._knots = times[self._ends]
-        self.breakpoints = self._knots[1:-1]
+
+    def breakpoints_between(self, t0: float, t1: float) -> Array:
+        """Samples at which the slope changes."""
+        inner = self._knots[1:-1]
+        return inner[slice(*np.searchsorted(inner, [t0, t1]).tolist())]
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values of the straight line that contains `moment`."""
@@ -353,9 +355,9 @@ def within(left: float, right: float, switches: Sequence[float]) -> tuple[float,
     return left + inset * at_left, right - inset * at_right
 
 
-def breakpoints_of(time_signals: Iterable[TimeSignal]) -> list[float]:
-    """Times at which a function of time is not analytic."""
-    return [float(t) for signal in time_signals for t in signal.breakpoints]
+def breakpoints_of(time_signals: Iterable[TimeSignal], t0: float, t1: float) -> list[float]:
+    """Times in [t0, t1) at which a function of time is not analytic."""
+    return [float(t) for signal in time_signals for t in signal.breakpoints_between(t0, t1)]
 
 
 _PROBES = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 0.8765431, 0.9712345])

@@ -32,6 +32,7 @@ from ctrlplan.studies.plans import references_of, waypoints_given
 from ctrlplan.studies.progress import each_plan
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder, run_plan
 from ctrlplan.trajectories import Trajectory, Waypoint
+from ctrlplan.trajectories.repeated import covering
 
 Metrics = dict[str, dict[str, float]]
 """Plan, metric, value."""
@@ -82,7 +83,8 @@ class Experiment(Displayed):
     plans : dict of str to Trajectory
         The references by name; waypoints stand for the standard set of
         `ctrlplan.studies.standard_plans`: step, polynomial, trigonometric,
-        piecewise.
+        piecewise. A plan that repeats for all future times is repeated until after the
+        last sample time.
     timepts : ndarray, shape (ntime,)
         Sample times [s]; metrics are refined between them.
     waypoints : tuple of Waypoint
@@ -165,6 +167,9 @@ class Experiment(Displayed):
         references = references_of(plans)
         times = real_array(timepts, "timepts")
         _check_start(start, references.values(), times)
+        last = float(times.max(initial=-math.inf))
+        if math.isfinite(last):
+            references = {name: covering(plan, last) for name, plan in references.items()}
         _check_band(band)
         checked = {
             "plans": references,

@@ -21,6 +21,7 @@ from ctrlplan.systems.flat import create_flat_iosystem, derived_system_of
 from ctrlplan.systems.source import create_source_iosystem
 from ctrlplan.traits import declare, traits_of
 from ctrlplan.trajectories import PathPlan, Trajectory
+from ctrlplan.trajectories.trajectory import check_end
 
 _SETTLED = 1e-9
 """Size of the rates at the end of a plan, relative to their terms, below which the plant rests there."""
@@ -134,6 +135,7 @@ class TVLQR(Displayed):
         """
         if not isinstance(flat, DerivedFlatSystem):
             raise TypeError(f"flat must be a flat system from equations for TVLQR, got {type(flat).__name__}")
+        check_end(plan)
         n, m = flat.nstates, flat.ninputs
         q, r = _weight(self.Q, "Q", n, strict=False), _weight(self.R, "R", m, strict=True)
         inverse = np.linalg.inv(r)

@@ -22,6 +22,7 @@ from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.extrema import stationary_times
 from ctrlplan.trajectories.files import signal_names
 from ctrlplan.trajectories.newton_spline import NewtonSpline
+from ctrlplan.trajectories.trajectory import check_end
 from ctrlplan.trajectories.transition import Transition, extrapolated, series, taylor_value, transition
 
 _ROUNDING, _MATTERS = 1e-12, 1e-6
@@ -210,6 +211,7 @@ class _Horizons:
         alpha: float | None,
         min_horizon: float | None,
     ) -> None:
+        check_end(plan)
         self.shrinking = horizon == "shrinking"
         if isinstance(horizon, str) and not self.shrinking:
             raise ValueError(f'horizon must be a number of seconds or "shrinking", got {horizon!r}')

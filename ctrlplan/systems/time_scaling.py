@@ -23,6 +23,7 @@ from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.combined import is_shaped
 from ctrlplan.trajectories.files import signal_names
+from ctrlplan.trajectories.repeated import one_pass
 from ctrlplan.trajectories.retimed import composed
 
 
@@ -216,6 +217,7 @@ def _severity(
 
 def _checked_times(plan: Trajectory, n: int, bandwidth: float | None, catch_up: float | None) -> tuple[float, float]:
     """Bandwidth [rad/s] of n lags and time constant [s] with which the delay is made up."""
+    plan = one_pass(plan)
     if bandwidth is None and not plan.duration:
         raise ValueError("bandwidth must be given for a plan without duration, got None")
     w = 10.0 / plan.duration if bandwidth is None else checked_finite(bandwidth, "bandwidth", above=0.0)

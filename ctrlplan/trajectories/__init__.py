@@ -4,9 +4,10 @@
 ``plan.extrema(nu)`` and ``plan.peak(nu)`` the extrema between samples too,
 ``plan.plot()`` a figure that ``plt.show()`` shows (``ax=drawn.axes`` overlays a
 second plan). Plans are added, scaled, shifted (``shift``), retimed
-(``retime``), joined (``then``), stacked (`stack`) and split (``select``), and
-stopped (``stop``) or brought to a constant velocity (``to_velocity``) in minimum time;
-``plan.save(path)`` writes JSON that `load_trajectory` restores exactly.
+(``retime``), joined (``then``), repeated (``repeat``), stacked (`stack`) and split
+(``select``), and stopped (``stop``) or brought to a constant velocity
+(``to_velocity``) in minimum time; ``plan.save(path)`` writes JSON that
+`load_trajectory` restores exactly.
 
 Before its start a plan holds its first position, after its end the last, with
 all derivatives zero. Times are in seconds, signals are (channel, time).
@@ -25,6 +26,7 @@ from ctrlplan.trajectories.piecewise import PiecewiseSpline
 from ctrlplan.trajectories.piecewise_polynomial import PiecewisePolynomial
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.profiles import SCurve, Trapezoid
+from ctrlplan.trajectories.repeated import Repeated
 from ctrlplan.trajectories.residual import residual_spectrum
 from ctrlplan.trajectories.retimed import Retimed
 from ctrlplan.trajectories.shaper_factor import ShaperFactor
@@ -50,6 +52,7 @@ __all__ = [
     "PiecewisePolynomial",
     "PiecewiseSpline",
     "PolySpline",
+    "Repeated",
     "Retimed",
     "SCurve",
     "Scaled",

@@ -17,6 +17,7 @@ from ctrlplan._checks import checked_finite, one_number
 from ctrlplan.trajectories.combined import Joined
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.cycle import knots_of, moved
+from ctrlplan.trajectories.repeated import Repeated
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline
@@ -57,6 +58,8 @@ def on_cycle(plan: Trajectory, dt: float, limits: Mapping[str, object] | None = 
                 raise ValueError(f"parts[{k}] of a joined plan: {error}") from None
         same = all(part is before for part, before in zip(parts, plan.parts, strict=True))
         return plan if same else Joined(parts)
+    if isinstance(plan, Repeated):
+        return _repeated_on_cycle(plan, dt, limits)
     if not plan.duration:
         return plan
     knots = knots_of(plan)
@@ -69,6 +72,17 @@ def on_cycle(plan: Trajectory, dt: float, limits: Mapping[str, object] | None = 
     from ctrlplan.planning.cycle import lengthened
 
     return lengthened(plan, dt, counts, limits)
+
+
+def _repeated_on_cycle(plan: Repeated, dt: float, limits: Mapping[str, object] | None) -> Trajectory:
+    """The same with the period on a cycle."""
+    if plan.since != plan.start:
+        raise ValueError(
+            f"a plan must be put on the cycle before it repeats, got one that repeats from {plan.since:g} s on after "
+            f"its start at {plan.start:g} s"
+        )
+    period = on_cycle(plan.plan, dt, limits)
+    return plan if period is plan.plan else Repeated(period, plan.count)
 
 
 def _joined_in_motion(plan: Joined) -> bool:

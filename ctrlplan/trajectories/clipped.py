@@ -31,7 +31,7 @@ class Clipped(Trajectory):
     Attributes
     ----------
     plan : Trajectory
-        The argument.
+        The argument; a number of its periods if it repeats for all future times.
 
     Raises
     ------
@@ -55,6 +55,8 @@ class Clipped(Trajectory):
     _shifts: Array  # from the start of the plan's segment to that of the own one [s]
 
     def __init__(self, plan: Trajectory, start: float, end: float) -> None:
+        from ctrlplan.trajectories.repeated import covering  # which cuts by this class
+
         check_kind(plan, "plan", Trajectory)
         first, last = checked_finite(start, "start"), checked_finite(end, "end")
         if not plan.start <= first < last <= plan.end:
@@ -62,6 +64,7 @@ class Clipped(Trajectory):
                 f"start and end must increase and lie within the plan, from {plan.start:g} s to {plan.end:g} s, got "
                 f"{first:g} s and {last:g} s"
             )
+        plan = covering(plan, last)
         inner = plan.breakpoints[(plan.breakpoints > first) & (plan.breakpoints < last)]
         number = int(np.searchsorted(plan.breakpoints, first, side="right")) - 1
         begins = np.array([first, *inner])

@@ -16,7 +16,7 @@ from ctrlplan._display import counted
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
-from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.trajectory import Trajectory, check_end
 
 
 class _OfParts(Trajectory):
@@ -401,7 +401,9 @@ def stack(plans: Iterable[Trajectory], labels: Sequence[str] | None = None) -> T
     ValueError
         If there is no plan, or labels are not unique.
     """
-    return Stacked(plans, labels)
+    from ctrlplan.trajectories.repeated import combined
+
+    return combined(lambda parts: Stacked(parts, labels), _trajectories(plans))
 
 
 def _objects(rows: list[list[Value]]) -> Any:
@@ -413,6 +415,13 @@ def _objects(rows: list[list[Value]]) -> Any:
 
 
 def _checked_parts(parts: Iterable[Trajectory]) -> tuple[Trajectory, ...]:
+    members = _trajectories(parts)
+    for i, part in enumerate(members):
+        check_end(part, f"parts[{i}]")
+    return members
+
+
+def _trajectories(parts: Iterable[Trajectory]) -> tuple[Trajectory, ...]:
     members = tuple(parts)
     if not members:
         raise ValueError("a combination needs at least one trajectory, got none")
@@ -436,14 +445,14 @@ def check_join(before: Trajectory, after: Trajectory) -> None:
     if abs(after.start - before.end) > 1e-9 * (before.duration + after.duration):
         raise ValueError(f"parts must follow one another in time, got {after.start} s after {before.end} s")
     last, first = before.final, after.initial
-    if np.any(first != last) and np.any(np.abs(first - last) > _slack(before, after)):
+    if np.any(first != last) and np.any(np.abs(first - last) > join_slack(before, after)):
         raise ValueError(
             f"positions must agree where trajectories join, got {first.tolist()} after {last.tolist()} "
             f"at {before.end:g} s"
         )
 
 
-def _slack(*parts: Trajectory) -> Array:
+def join_slack(*parts: Trajectory) -> Array:
     """Tolerance (naxes,) of position differences, relative to the range, so that a distant origin hides no jump."""
     extrema = [part.extrema() for part in parts]
     ranges = np.max([e.maximum - e.minimum for e in extrema], axis=0)

@@ -12,7 +12,7 @@ from ctrlplan._checks import check_kind, finite_vector
 from ctrlplan.trajectories.common import Array, ComplexArray
 from ctrlplan.trajectories.quadrature import gauss
 from ctrlplan.trajectories.shaper_factor import checked_damping
-from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.trajectory import Trajectory, check_end
 
 _TURNS = 1024.0
 """Phase |p| h [rad] of a mode over a part of a segment, above which it is divided."""
@@ -85,6 +85,7 @@ def residual_spectrum(plan: Trajectory, frequencies: ArrayLike, damping: ArrayLi
     array([1.   , 0.865, 0.835, 0.804])
     """
     check_kind(plan, "plan", Trajectory)
+    check_end(plan)
     omega, zeta = checked_modes(frequencies, damping)
     highest = float(omega.max())
     if highest * plan.duration > _LONGEST:

@@ -14,7 +14,7 @@ from ctrlplan.trajectories.combined import is_shaped, is_unit_rate
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
 from ctrlplan.trajectories.time_law import TimeLaw
-from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.trajectory import Trajectory, check_end
 
 _ROUNDING = 1e-12
 """Relative rounding error allowed in times and rates."""
@@ -180,6 +180,8 @@ def _composed_jets(outer: Array, inner: Array) -> Array:
 
 def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
     """Values of a time law at its breakpoints, after a check that it runs through the plan."""
+    check_end(plan)
+    check_end(law, "law")
     if not plan.duration:
         raise ValueError("plan must have a duration, got a step")
     if law.naxes != 1:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator
-from functools import reduce
+from functools import partial, reduce
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -16,6 +16,7 @@ from ctrlplan._display import Displayed, Facts, Part, Table, counted, number, sh
 from ctrlplan.trajectories.combined import Sum
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.fields import Fields
+from ctrlplan.trajectories.repeated import combined
 from ctrlplan.trajectories.shaper_factor import (
     ShaperFactor,
     checked_damping,
@@ -345,7 +346,8 @@ class Shaper(Displayed, Fields):
             if loss > 1e-3:
                 raise ValueError(said)
             warnings.warn(said, stacklevel=2)
-        return Sum((weight * part for part, weight in zip(parts, self.weights.tolist(), strict=True)), shaped=True)
+        weighted = [weight * part for part, weight in zip(parts, self.weights.tolist(), strict=True)]
+        return combined(partial(Sum, shaped=True), weighted)
 
     def then(self, other: Shaper) -> Shaper:
         """Convolution of two shapers, for two modes."""

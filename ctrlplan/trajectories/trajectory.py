@@ -309,9 +309,7 @@ class Trajectory(Displayed, Fields, ABC):
         >>> cp.PiecewiseSpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1), cp.Waypoint(3, 0)]).breakpoints_between(0, 3)
         array([0., 1.])
         """
-        first, last = checked_number(t0, "t0"), checked_number(t1, "t1")
-        if last < first:
-            raise ValueError(f"t1 must not be below t0, got {last:g} s after {first:g} s")
+        first, last = self._checked_interval(t0, t1)
         begin, end = np.searchsorted(self.breakpoints, [first, last]).tolist()
         return self.breakpoints[begin:end].copy()
 
@@ -552,6 +550,7 @@ class Trajectory(Displayed, Fields, ABC):
             If rounding changes an interval of the plan by more than 1e-6 of its
             length.
         """
+        check_end(self, "a trajectory to be retimed")
         if not self.duration:
             raise ValueError("a trajectory must have a duration to be retimed, got a step")
         wanted = checked_finite(duration, "duration", above=0.0)
@@ -628,9 +627,51 @@ class Trajectory(Displayed, Fields, ABC):
             of this one by more than 1e-9 of their range, or if the numbers of
             axes differ.
         """
-        from ctrlplan.trajectories.combined import Joined
+        from ctrlplan.trajectories.repeated import followed
 
-        return Joined((self, other))
+        return followed(self, other)
+
+    def repeat(self, count: int | None) -> Trajectory:
+        """This trajectory a number of times, or for all future times.
+
+        Its final position must be the initial one. Derivatives that differ at both ends
+        jump where it repeats; `jumps` lists them.
+
+        Parameters
+        ----------
+        count : int or None
+            Number of periods; None: for all future times. The attributes `end` and
+            `duration` are then infinite, `breakpoints` and `waypoints` those of one
+            period, and `final` is an error. Functions that require an end raise a
+            ValueError. `then` leads to such a plan, `Clipped` is a part of it, and sums and
+            stacks repeat with the common period of their parts.
+
+        Returns
+        -------
+        Trajectory
+            With the attributes plan (one period), count and period; this trajectory if
+            the count is 1.
+
+        Raises
+        ------
+        ValueError
+            If the count is not an integer above 0; if the trajectory has no duration or no
+            end, or its ends differ by more than 1e-9 of the range of its position.
+
+        Examples
+        --------
+        A cam through six waypoints, for all future times:
+
+        >>> import ctrlplan as cp
+        >>> points = [(0.4, 2.0), (0.7, 10.0), (1.2, 10.0), (1.5, 5.0), (1.8, 1.0)]
+        >>> points = [cp.Waypoint(0, 0, 0, 0), *(cp.Waypoint(time, lift) for time, lift in points)]
+        >>> cam = cp.PiecewiseSpline.cyclic(points, 2.0).repeat(None)
+        >>> cp.simulate(cp.create_source_iosystem(cam), [0.0, 0.7, 1000.7]).outputs[0].round(9).tolist()
+        [0.0, 10.0, 10.0]
+        """
+        from ctrlplan.trajectories.repeated import Repeated
+
+        return self if count == 1 and not isinstance(count, bool) else Repeated(self, count)
 
     def stop(
         self,
@@ -755,8 +796,10 @@ class Trajectory(Displayed, Fields, ABC):
     def select(self, labels: Sequence[str]) -> Trajectory:
         """Trajectory of some axes by name, in the given order."""
         from ctrlplan.trajectories.combined import Selected
+        from ctrlplan.trajectories.repeated import combined
 
-        return Selected(self, (labels,) if isinstance(labels, str) else labels)
+        names = (labels,) if isinstance(labels, str) else tuple(labels)
+        return combined(lambda parts: Selected(parts[0], names), [self])
 
     def export(
         self,
@@ -903,16 +946,18 @@ class Trajectory(Displayed, Fields, ABC):
 
     def __add__(self, other: Trajectory) -> Trajectory:
         from ctrlplan.trajectories.combined import Sum
+        from ctrlplan.trajectories.repeated import combined
 
-        return Sum((self, other)) if isinstance(other, Trajectory) else NotImplemented
+        return combined(Sum, [self, other]) if isinstance(other, Trajectory) else NotImplemented
 
     def __sub__(self, other: Trajectory) -> Trajectory:
         return self + (-1.0) * other if isinstance(other, Trajectory) else NotImplemented
 
     def __mul__(self, factor: float) -> Trajectory:
         from ctrlplan.trajectories.combined import Scaled
+        from ctrlplan.trajectories.repeated import combined
 
-        return Scaled(self, factor) if _is_factor(factor) else NotImplemented
+        return combined(lambda parts: Scaled(parts[0], factor), [self]) if _is_factor(factor) else NotImplemented
 
     __rmul__ = __mul__
 
@@ -924,15 +969,15 @@ class Trajectory(Displayed, Fields, ABC):
 
     def _describe(self) -> Iterator[Part]:
         axes = ", ".join(self.labels)
-        when = f"from {self.start:g} s to {self.end:g} s" if self.duration else f"at {self.start:g} s"
+        until = f"to {self.end:g} s" if math.isfinite(self.end) else "on"
+        when = f"from {self.start:g} s {until}" if self.duration else f"at {self.start:g} s"
         yield f"{type(self).__name__} of {axes} {when}"
         yield Facts(self._facts())
         if self.waypoints:
             yield waypoint_table(self.waypoints, self.labels)
-        ends = [
-            ["initial position", *map(number, self.initial.tolist())],
-            ["final position", *map(number, self.final.tolist())],
-        ]
+        ends = [["initial position", *map(number, self.initial.tolist())]]
+        if math.isfinite(self.end):
+            ends.append(["final position", *map(number, self.final.tolist())])
         quick = self._has_quick_peaks()
         yield Table("Positions and peaks", ("", *self.labels), [*ends, *(self._peaks() if quick else [])])
         if not quick:
@@ -945,7 +990,7 @@ class Trajectory(Displayed, Fields, ABC):
             jumps = self.jumps(0) if self._has_quick_peaks() else ()
         times = list(dict.fromkeys(f"{jump.time:.6g} s" for jump in jumps))
         return [
-            ("duration", f"{self.duration:.6g} s" if self.duration else ""),
+            ("duration", f"{self.duration:.6g} s" if 0.0 < self.duration < math.inf else ""),
             ("segments", f"{self.breakpoints.size - 1}" if self.breakpoints.size > 2 else ""),
             ("position jumps at", ", ".join(times[:4]) + (f" and {len(times) - 4} more" if len(times) > 4 else "")),
         ]
@@ -967,6 +1012,14 @@ class Trajectory(Displayed, Fields, ABC):
                 peaks = [MISSING] * self.naxes
             rows.append([f"peak {ENTRIES[nu]} [1/s{f'^{nu}' if nu > 1 else ''}]", *peaks])
         return rows
+
+    @staticmethod
+    def _checked_interval(t0: float, t1: float) -> tuple[float, float]:
+        """Two times in order, each of which may be infinite."""
+        first, last = checked_number(t0, "t0"), checked_number(t1, "t1")
+        if last < first:
+            raise ValueError(f"t1 must not be below t0, got {last:g} s after {first:g} s")
+        return first, last
 
     def _moved(self, origin: float, target: float, rate: float) -> Self:
         """As `map_time`, with a check of the rounding of the intervals between times."""
@@ -1135,6 +1188,15 @@ class Trajectory(Displayed, Fields, ABC):
         if 0 <= segment < self.breakpoints.size - 1:
             return self.segment_series(segment, s + (origin - float(self.breakpoints[segment])), order)
         return [[value, *[0.0] * order] for value in (self.initial if segment < 0 else self.final).tolist()]
+
+
+def check_end(plan: Trajectory, name: str = "plan") -> None:
+    """Raise for a plan that repeats for all future times."""
+    if plan.end == math.inf:
+        raise ValueError(
+            f"{name} must have an end, got a plan that repeats for all future times; use the part that repeats (its "
+            "attribute `plan`), or a number of repetitions of it by `repeat`"
+        )
 
 
 def _no_rows(*_given: object) -> None:

@@ -50,6 +50,7 @@ ARGUMENTS = {
     "positions": lambda: [0.5, 1.25, 2.0],
     "squared_rates": lambda: [[0.3, 1.1], [0.6, 2.0], [1.1, 0.7]],
     "start_state": lambda: [[1.0, 2.0], [0.5, -1.0], [0.1, 0.0]],
+    "count": lambda: 3,
     "law": lambda: trajectories.PolySpline([Waypoint(3.0, -1.0, 0.7), Waypoint(4.0, 0.1), Waypoint(7.5, 2.0, 0.3)]),
 }
 
@@ -74,6 +75,8 @@ def build(kind):
         if parameter.default is inspect.Parameter.empty and name not in given:
             assert name in ARGUMENTS, f"say in ARGUMENTS what the argument {name} of {kind.__name__} may be"
             given[name] = ARGUMENTS[name]()
+    if kind is trajectories.Repeated:  # of a plan that returns to its first position
+        given["plan"] = trajectories.PiecewiseSpline([*POINTS, Waypoint.from_jets(2.5, x=[0.0, 1.0], z=[1.0])])
     return kind(**given, labels=["p", "q", "r", "s"]) if kind is trajectories.Stacked else kind(**given)
 
 

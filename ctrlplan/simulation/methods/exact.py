@@ -47,7 +47,8 @@ def _run(job: Job, form: LinearForm) -> Record:
         )
         > 0
     )
-    breakpoints = [t for plan, _ in plans for t in plan.breakpoints]
+    first, last = float(job.times[0]), float(job.times[-1])
+    breakpoints = [t for plan, _ in plans for t in plan.breakpoints_between(first, last)]
     watched = job.watched()
     times = with_event_times(job.times, watched, lambda: form.a)
 

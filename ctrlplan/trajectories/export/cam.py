@@ -26,7 +26,7 @@ import numpy as np
 from ctrlplan._types import Array
 from ctrlplan.trajectories.export.cells import segment_peak
 from ctrlplan.trajectories.export.csv_table import CSV
-from ctrlplan.trajectories.export.formats import Files, Format, Options, SampledTable, decimal, plain, with_duration
+from ctrlplan.trajectories.export.formats import Files, Format, Options, SampledTable, decimal, one_period, plain
 from ctrlplan.trajectories.files import signal_names, signal_rows
 from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -60,7 +60,7 @@ class CamCSV(Format):
 
     def files(self, plan: Trajectory, path: Path, options: Options) -> Files:
         """Contents by path; as `Format.files`."""
-        cam = cam_of(with_duration(plan, ".cam.csv"), options)
+        cam = cam_of(one_period(plan, ".cam.csv"), options)
         names = tuple(signal_names(plan.labels, 2))
         table = CSV().encoded(SampledTable(cam.times, names, signal_rows(plan, cam.times, 2)))
         return {path: f"# {cam.stated(plan)}\nmaster" + table.removeprefix("time")}
@@ -78,7 +78,7 @@ class CamST(Format):
 
     def files(self, plan: Trajectory, path: Path, options: Options) -> Files:
         """Contents by path; as `Format.files`."""
-        cam = cam_of(with_duration(plan, ".cam.st"), options)
+        cam = cam_of(one_period(plan, ".cam.st"), options)
         count = cam.times.size
         if count > _ELEMENTS:
             raise ValueError(f"a cam of CODESYS must have at most {_ELEMENTS} points, got {count}; reduce timepts")

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 from ctrlplan._checks import checked_count, checked_finite, checked_timepts
 from ctrlplan._types import Array
 from ctrlplan.trajectories.files import signal_names, signal_rows
-from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.repeated import Repeated
+from ctrlplan.trajectories.trajectory import Trajectory, check_end
 
 Files = Mapping[Path, str | bytes]
 
@@ -111,6 +112,11 @@ class Options:
         """Sample times of an interval; default: 1001 from start to end."""
         if self.timepts is not None:
             return sample_times(self.timepts)
+        if math.isinf(end):
+            raise ValueError(
+                "timepts must be given to export a plan that repeats for all future times, got none; or export the "
+                "part that repeats, its attribute `plan`"
+            )
         if self.dt is None:
             return np.linspace(start, end, 1001)
         count = (end - start) / self.dt
@@ -195,10 +201,18 @@ def sample_times(timepts: ArrayLike) -> Array:
 
 
 def with_duration(plan: Trajectory, ending: str) -> Trajectory:
-    """The plan, checked to have a duration."""
+    """The plan, checked to have a duration and an end."""
+    check_end(plan, f"a plan written as {ending}")
     if not plan.duration:
         raise ValueError(f"a plan written as {ending} must have a duration, got a step")
     return plan
+
+
+def one_period(plan: Trajectory, ending: str) -> Trajectory:
+    """The plan, checked to have a duration; of one that repeats for all future times, one period."""
+    if isinstance(plan, Repeated) and plan.count is None and plan.since == plan.start:
+        return plan.plan
+    return with_duration(plan, ending)
 
 
 def decimal(value: float) -> str:
