@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ctrlplan._types import Array
 from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
-from ctrlplan.simulation.network import Network
+from ctrlplan.simulation.network import Block, Network
 from ctrlplan.simulation.scales import in_turn
 from ctrlplan.simulation.signals import (
     RESOLVED,
@@ -428,12 +428,7 @@ class _Schedule:
     def __init__(self, network: Network, time_signals: Sequence[TimeSignal], first: float, last: float) -> None:
         self._time_signals = time_signals
         self.prolong([], first, last)
-        for i in network.blocks_with("period"):
-            if float(network.blocks[i].period or 0.0) < 4.0 * self._tolerance:
-                raise ValueError(
-                    f"the period of {network.blocks[i].name} must exceed the rounding of times up to "
-                    f"{max(abs(first), abs(last)):g} s, got {network.blocks[i].period:g} s"
-                )
+        check_periods([network.blocks[i] for i in network.blocks_with("period")], first, last)
         self.samples = SampleTimes(network, first)
 
     @property
@@ -462,7 +457,7 @@ class _Schedule:
         due = self.samples.due(t + self._tolerance)
         if not due or equations is None:
             return x
-        return equations.sampled(due, t, x, values_after(self._time_signals, t, self._tolerance))
+        return equations.sampled(due, t, x, values_after(self._time_signals, np.array([t]), self._tolerance)[:, 0])
 
     def prolong(self, fixed: list[float], first: float, last: float) -> None:
         """Continue to a later end, with the breakpoints up to it."""
@@ -510,15 +505,28 @@ class SampleTimes:
         return other
 
 
-def values_after(time_signals: Sequence[TimeSignal], t: float, tolerance: float) -> Array:
-    """Signals (nsignals,) at a time, after a breakpoint that differs from it by rounding."""
+def values_after(time_signals: Sequence[TimeSignal], times: Array, tolerance: float) -> Array:
+    """Signals (nsignals, ntime) at times, after a breakpoint that differs from one by rounding."""
+    seen = [signal.at(_after(signal.breakpoints, times, tolerance)) for signal in time_signals]
+    return np.asarray(np.concatenate([np.zeros((0, times.size)), *seen]))
 
-    def moment(marks: Array) -> float:
-        k = int(np.searchsorted(marks, t))
-        return float(marks[k]) if k < len(marks) and marks[k] - t <= tolerance else t
 
-    seen = [signal.at(np.array([moment(signal.breakpoints)])) for signal in time_signals]
-    return np.asarray(np.concatenate([np.zeros((0, 1)), *seen])[:, 0])
+def _after(marks: Array, times: Array, tolerance: float) -> Array:
+    """Times, replaced by a breakpoint that follows within a tolerance."""
+    if not len(marks):
+        return times
+    following = np.asarray(marks)[np.minimum(np.searchsorted(marks, times), len(marks) - 1)]
+    return np.where((following >= times) & (following - times <= tolerance), following, times)
+
+
+def check_periods(blocks: Sequence[Block], first: float, last: float) -> None:
+    """Raise for sampled blocks with sample times that are not distinct in a run."""
+    for block in blocks:
+        if float(block.period or 0.0) < 4.0 * time_tolerance(first, last):
+            raise ValueError(
+                f"the period of {block.name} must exceed the rounding of times up to "
+                f"{max(abs(first), abs(last)):g} s, got {block.period:g} s"
+            )
 
 
 def time_tolerance(first: float, last: float) -> float:
