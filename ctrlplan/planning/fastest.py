@@ -315,12 +315,13 @@ def fastest_under(
         return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold, endless=False)
     if hold == "path":
         limited.check_constant('limits with hold="path"')
+        if isinstance(plan, PathPlan):
+            limited.check_smooth(plan)
+            return _fastest_between_stops(plan, limited, span)
         if limited.derivatives_only and limited.order <= 2:
             return _fastest_on_path(plan, limited, span)
         limited.check_smooth(plan)
         _check_open(plan)
-        if isinstance(plan, PathPlan):
-            return _fastest_on_path(plan, limited, span)
     uniform = fastest_within(plan, limited, span)
     if hold == "shape":
         return uniform
@@ -330,7 +331,7 @@ def fastest_under(
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
 
 
-def _fastest_on_path(plan: PathPlan, limited: Limited, span: tuple[float, float] | None) -> Fastest:
+def _fastest_between_stops(plan: PathPlan, limited: Limited, span: tuple[float, float] | None) -> Fastest:
     """Plan with a time law of minimum duration for each segment; the stops make them independent."""
     laws: list[Trajectory] = []
     for curve, direction, law in zip(plan.segments, plan.directions, plan.laws, strict=True):

@@ -9,6 +9,8 @@ method     applies to                                  algorithm
 =========  ==========================================  =========================================
 exact      linear loops with any nesting; plans,       one matrix exponential for each segment
            constants or samples as inputs              of an input; the error is rounding
+           with linear discrete blocks, and delays     the recursion from sample time to sample time,
+           of what they hold or read                   plans exact in between; the error is rounding
 compiled   nonlinear loops whose blocks can be traced  blocks traced with CasADi symbols, compared
            (``pip install "ctrlplan[fast]"``)          with Python, and integrated by CVODES with
                                                        the exact Jacobian

@@ -17,6 +17,7 @@ from ctrlplan.simulation.loop_form import NODES, NTERMS, SIGMA, LoopForm, Rows
 from ctrlplan.simulation.loop_inputs import is_cyclic
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.plan_cells import PlanCells
+from ctrlplan.simulation.recurrences import repeated
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.chebyshev import transform
 
@@ -369,37 +370,9 @@ def _marched(
                 moved = change @ found[k]
                 found[k + 1] = found[k] + (moved if forced is None else moved + forced[k])
         else:
-            found[first + 1 : last + 1] = _repeated(found[first], change, own, last - first)
+            found[first + 1 : last + 1] = repeated(found[first], change, own, last - first)
         first = last
     return found
-
-
-def _repeated(state: Array, change: Array, forced: Array | None, count: int) -> Array:
-    """States (count, nstates, ...) after each of many equal steps x + change x + forced.
-
-    In about sqrt(count) blocks: the responses of all blocks from zero are computed
-    together, then the state from block to block.
-    """
-    per = math.isqrt(count - 1) + 1
-    nblocks, n = -(-count // per), len(change)
-    inner = np.zeros((nblocks, per, *state.shape))
-    powers = np.empty((per, n, n))
-    powers[0] = change
-    for j in range(1, per):
-        powers[j] = powers[j - 1] + change + change @ powers[j - 1]
-    if forced is not None:
-        steps = np.zeros_like(inner)
-        steps.reshape(-1, *state.shape)[:count] = forced
-        inner[:, 0] = steps[:, 0]
-        for j in range(1, per):
-            inner[:, j] = inner[:, j - 1] + inner[:, j - 1] @ change.T + steps[:, j]
-    starts = np.empty((nblocks, *state.shape))
-    for k in range(nblocks):
-        starts[k] = state
-        state = state + (powers[-1] @ state + inner[k, -1])
-    columns = starts.reshape(nblocks, n, -1)
-    moved = np.einsum("jab,kbc->kjac", powers, columns).reshape(inner.shape)
-    return (starts[:, None] + moved + inner).reshape(-1, *state.shape)[:count]
 
 
 def _states_at_nodes(form: LoopForm, c: Array, part: _Part) -> Array:

@@ -268,7 +268,7 @@ class SampledSteps:
         due = samples.due(t + tolerance)
         if not due:
             return x
-        w = np.concatenate([u, values_after(self._signals, t, tolerance)])
+        w = np.concatenate([u, values_after(self._signals, np.array([t]), tolerance)[:, 0]])
         if due not in self._jumps:
             self._jumps[due] = self._jump(due, t)
         jump = self._jumps[due]
@@ -349,7 +349,8 @@ class DiscreteSteps:
         return self._network.to_outputs(equations.signals(t, x, w))
 
     def _values(self, t: float, u: Array) -> Array:
-        return np.concatenate([u, values_after(self._signals, t, time_tolerance(self._grid.time(0), t))])
+        tolerance = time_tolerance(self._grid.time(0), t)
+        return np.concatenate([u, values_after(self._signals, np.array([t]), tolerance)[:, 0]])
 
 
 class NumericalSteps:
@@ -404,7 +405,7 @@ class NumericalSteps:
                     equations = Interpreted(self._network.for_trials(), self._params, (t, x), self._trials)
                 tolerance = time_tolerance(self._grid.time(0), t)
                 due = self._course.state()[0].due(t + tolerance)
-                values = values_after(self._signals, t, tolerance)
+                values = values_after(self._signals, np.array([t]), tolerance)[:, 0]
                 x = equations.sampled(due, t, x, values) if due else x
             return self._read(t, x)
         finally:

@@ -96,25 +96,32 @@ def linear_form(system: System) -> LinearForm:
     return LinearForm(form.a[0], form.b[0], form.c[0], form.d[0], form.sources)
 
 
-def linear_forms(systems: Sequence[System]) -> LinearForm:
+def linear_forms(systems: Sequence[System], discrete: bool = False) -> LinearForm:
     """Linear forms of systems with equal connections, stacked.
+
+    Parameters
+    ----------
+    systems : sequence of control systems
+        The systems.
+    discrete : bool, optional
+        Whether discrete blocks are linear too: A then gives the next states.
 
     Raises
     ------
     NotLinearError
-        If a block is nonlinear or discrete.
+        If a block is nonlinear, or discrete unless these are allowed.
     ValueError
         If an algebraic loop has no unique solution, or the systems differ in more
         than numerical values.
     """
-    kinds = {_kind(system) for system in systems}
+    kinds = {_kind(system, discrete) for system in systems}
     if len(kinds) > 1:
         raise _unlike(systems)
     kind = kinds.pop()
     if kind is ct.InterconnectedSystem:
-        return _interconnections(systems)
+        return _interconnections(systems, discrete)
     if kind is ct.TransferFunction:
-        return linear_forms([ct.ss(system) for system in systems])
+        return linear_forms([ct.ss(system) for system in systems], discrete)
     if kind is ct.StateSpace:
         matrices = [[_matrix(system, name) for system in systems] for name in "ABCD"]
         if any(matrix.shape != row[0].shape for row in matrices for matrix in row):
@@ -142,8 +149,8 @@ def _matrix(system: System, name: str) -> Array:
     return matrix
 
 
-def _kind(system: System) -> type:
-    if system.dt not in (None, 0):
+def _kind(system: System, discrete: bool) -> type:
+    if not discrete and system.dt not in (None, 0):
         raise NotLinearError(f"block {system.name} is discrete (dt = {system.dt})")
     for kind in (ct.InterconnectedSystem, ct.StateSpace, ct.TransferFunction):
         if isinstance(system, kind):
@@ -159,25 +166,59 @@ def _unlike(systems: Sequence[System]) -> ValueError:
     )
 
 
-def _interconnections(systems: Sequence[System]) -> LinearForm:
+def _interconnections(systems: Sequence[System], discrete: bool) -> LinearForm:
     first = systems[0]
-    names = ("connect_map", "input_map", "output_map")
-    connect, external, outputs = (np.asarray(getattr(first, name), dtype=float) for name in names)
+    maps = ("connect_map", "input_map", "output_map")
+    connect, external, outputs = (np.asarray(getattr(first, name), dtype=float) for name in maps)
     for system in systems[1:]:
-        same = all(np.array_equal(getattr(system, name), getattr(first, name)) for name in names)
+        same = all(np.array_equal(getattr(system, name), getattr(first, name)) for name in maps)
         if len(system.syslist) != len(first.syslist) or not same:
             raise _unlike(systems)
-    forms = [linear_forms(blocks) for blocks in zip(*(system.syslist for system in systems), strict=True)]
+    forms = [linear_forms(blocks, discrete) for blocks in zip(*(system.syslist for system in systems), strict=True)]
     counts = [block.ninputs or 0 for block in first.syslist]
+    names = [str(block.name) for block in first.syslist]
+    return closed(forms, counts, names, connect, external.reshape(sum(counts), -1), outputs, first.name)
+
+
+def closed(
+    forms: Sequence[LinearForm],
+    counts: Sequence[int],
+    names: Sequence[str],
+    connect: Array,
+    external: Array,
+    outputs: Array,
+    name: str,
+) -> LinearForm:
+    """Linear form of connected blocks: u = connect y + external r for their outputs y and external inputs r.
+
+    Parameters
+    ----------
+    forms : sequence of LinearForm
+        The blocks, stacked; their inputs, then the outputs of sources inside of them.
+    counts : sequence of int
+        Number of inputs of each block, without those sources.
+    names : sequence of str
+        Names of the blocks.
+    connect, external : ndarray, shapes (ninputs, noutputs) and (ninputs, nexternal)
+        Connections, where the inputs and outputs are those of all blocks.
+    outputs : ndarray, shape (noutputs of the result, noutputs + ninputs)
+        Outputs of the result, from the outputs and the inputs of all blocks.
+    name : str
+        Name of the result.
+
+    Raises
+    ------
+    ValueError
+        If an algebraic loop has no unique solution, or products of gains overflow.
+    """
     a, c = (_diagonal([getattr(form, name) for form in forms]) for name in "ac")
     b, d = (_diagonal([getattr(form, name)[..., :k] for form, k in zip(forms, counts, strict=True)]) for name in "bd")
     e, f = (_diagonal([getattr(form, name)[..., k:] for form, k in zip(forms, counts, strict=True)]) for name in "bd")
-    external = external.reshape(sum(counts), -1)
     # u = connect y + external r and y = c x + d u + f s, solved for y.
     closing = np.eye(d.shape[1]) - d @ connect
-    singular = _singular_loop(closing)
+    singular = singular_loop(closing)
     if singular.size:
-        owners = np.repeat([block.name for block in first.syslist], [block.noutputs for block in first.syslist])
+        owners = np.repeat(names, [form.c.shape[1] for form in forms])
         blocks = ", ".join(dict.fromkeys(owners[singular].tolist()))
         raise ValueError(f"blocks must not form an algebraic loop without a solution, got one of {blocks}")
     y_x, y_r, y_s = np.split(
@@ -196,7 +237,7 @@ def _interconnections(systems: Sequence[System]) -> LinearForm:
             tuple(source for form in forms for source in form.sources),
         )
     if not all(np.isfinite(matrix).all() for matrix in (form.a, form.b, form.c, form.d)):
-        raise ValueError(f"gains of the blocks in {first.name} must have finite products, got an overflow")
+        raise ValueError(f"gains of the blocks in {name} must have finite products, got an overflow")
     return form
 
 
@@ -212,12 +253,14 @@ def _diagonal(blocks: list[Array]) -> Array:
     return out
 
 
-def _singular_loop(closing: Array) -> NDArray[np.intp]:
+def singular_loop(closing: Array) -> NDArray[np.intp]:
     """Signals of an algebraic loop without a unique solution in one of the systems; empty if there is none.
 
     Only strongly connected signals are tested: large gains in series are not a loop.
     """
     size = closing.shape[1]
+    if not size:
+        return np.empty(0, dtype=np.intp)
     reach = (closing != 0.0) | np.eye(size, dtype=bool)
     for _ in range(size.bit_length()):
         reach = reach @ reach

@@ -18,6 +18,7 @@ from ctrlplan.simulation.built_forms import BuiltForm, BuiltForms, DisagreementE
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Block, Network, UnsupportedError
+from ctrlplan.simulation.sampled_form import SampledForm, sampled_form
 from ctrlplan.simulation.segments import DelayedSignal
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
 from ctrlplan.simulation.starts import command_starts
@@ -73,10 +74,17 @@ class Prepared(Displayed):
             self.network = Network.of(self.system)
         except UnsupportedError as error:
             self.unsupported = str(error)
+        self.sampled: SampledForm | None = None
+        self.not_sampled = self.not_linear
         for block in self._blocks():
             if block.delay is not None or block.period is not None:
                 what = "is a delay" if block.delay is not None else "is sampled"
                 self.not_linear = f"block {block.name} {what}"
+        if self.linear is None and self.network is not None and not self.is_discrete:
+            try:
+                self.sampled = sampled_form(self.network)
+            except NotLinearError as error:
+                self.not_sampled = str(error)
         self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
         self._built_forms = BuiltForms()
         self.starts = command_starts(self._blocks())

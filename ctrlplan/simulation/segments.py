@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ctrlplan._types import Array
 from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
-from ctrlplan.simulation.network import Network
+from ctrlplan.simulation.network import Block, Network
 from ctrlplan.simulation.scales import in_turn
 from ctrlplan.simulation.signals import (
     RESOLVED,
@@ -431,12 +431,7 @@ class _Schedule:
     def __init__(self, network: Network, time_signals: Sequence[TimeSignal], first: float, last: float) -> None:
         self._time_signals = time_signals
         self.prolong([], first, last)
-        for i in network.blocks_with("period"):
-            if float(network.blocks[i].period or 0.0) < 4.0 * self._tolerance:
-                raise ValueError(
-                    f"the period of {network.blocks[i].name} must exceed the rounding of times up to "
-                    f"{max(abs(first), abs(last)):g} s, got {network.blocks[i].period:g} s"
-                )
+        check_periods([network.blocks[i] for i in network.blocks_with("period")], first, last)
         self.samples = SampleTimes(network, first)
 
     @property
@@ -465,7 +460,7 @@ class _Schedule:
         due = self.samples.due(t + self._tolerance)
         if not due or equations is None:
             return x
-        return equations.sampled(due, t, x, values_after(self._time_signals, t, self._tolerance))
+        return equations.sampled(due, t, x, values_after(self._time_signals, np.array([t]), self._tolerance)[:, 0])
 
     def prolong(self, fixed: list[float], first: float, last: float) -> None:
         """Continue to a later end, with the breakpoints up to it."""
@@ -513,15 +508,30 @@ class SampleTimes:
         return other
 
 
-def values_after(time_signals: Sequence[TimeSignal], t: float, tolerance: float) -> Array:
-    """Signals (nsignals,) at a time, after a breakpoint that differs from it by rounding."""
+def values_after(time_signals: Sequence[TimeSignal], times: Array, tolerance: float) -> Array:
+    """Signals (nsignals, ntime) at times, after a breakpoint that differs from one by rounding."""
+    end = float(np.nextafter(times[-1] + tolerance, np.inf)) if times.size else 0.0
+    marks = [signal.breakpoints_between(times[0], end) if times.size else times for signal in time_signals]
+    seen = [signal.at(_after(near, times, tolerance)) for signal, near in zip(time_signals, marks, strict=True)]
+    return np.asarray(np.concatenate([np.zeros((0, times.size)), *seen]))
 
-    def moment(signal: TimeSignal) -> Array:
-        near = signal.breakpoints_between(t, float(np.nextafter(t + tolerance, np.inf)))
-        return near[:1] if near.size else np.array([t])
 
-    seen = [signal.at(moment(signal)) for signal in time_signals]
-    return np.asarray(np.concatenate([np.zeros((0, 1)), *seen])[:, 0])
+def _after(marks: Array, times: Array, tolerance: float) -> Array:
+    """Times, replaced by a breakpoint that follows within a tolerance."""
+    if not len(marks):
+        return times
+    following = np.asarray(marks)[np.minimum(np.searchsorted(marks, times), len(marks) - 1)]
+    return np.where((following >= times) & (following - times <= tolerance), following, times)
+
+
+def check_periods(blocks: Sequence[Block], first: float, last: float) -> None:
+    """Raise for sampled blocks with sample times that are not distinct in a run."""
+    for block in blocks:
+        if float(block.period or 0.0) < 4.0 * time_tolerance(first, last):
+            raise ValueError(
+                f"the period of {block.name} must exceed the rounding of times up to "
+                f"{max(abs(first), abs(last)):g} s, got {block.period:g} s"
+            )
 
 
 def time_tolerance(first: float, last: float) -> float:

@@ -14,6 +14,7 @@ import ctrlplan as cp
 from ctrlplan.simulation import Event
 
 METHODS = ("compiled", "python")
+LINEAR = ("exact", *METHODS)
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
 A = np.array([[-0.3, 1.0], [-2.0, -0.5]])
 B = np.array([[0.2], [1.0]])
@@ -52,7 +53,7 @@ def walked(x, times, instants, sample):
 # Sampled blocks
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LINEAR)
 @pytest.mark.parametrize("first", [0.0, 7.0])
 @pytest.mark.parametrize("offset", [0.0, 0.13])
 def test_a_sampled_controller(offset, first, method):
@@ -93,7 +94,7 @@ def test_at_its_samples_the_loop_is_that_of_the_peer():
     times = 0.1 * np.arange(31)
     peer = ct.input_output_response(peer_loop, times, PLAN(times), [0.2, 0.1, 0.4])
     loop = ct.interconnect([plant(), cp.sample_hold(law, 0.1)], inputs="r", outputs="y")
-    for method in METHODS:
+    for method in LINEAR:
         found = cp.simulate(loop, times, PLAN, [0.2, 0.1, 0.4, 0.0], method=method, **TIGHT)
         assert np.abs(found.outputs - peer.outputs).max() <= 1e-8
 
@@ -102,7 +103,7 @@ def gain(rows, source, sink, name):
     return ct.ss([], [], [], np.atleast_2d(rows), inputs=source, outputs=sink, name=name, dt=None)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LINEAR)
 def test_two_rates(method):
     """Position every 0.3 s, speed every 0.2 s, the second with an offset of 0.05 s."""
     b = np.array([[0.2, 0.0], [1.0, 1.0]])
@@ -128,7 +129,7 @@ def test_two_rates(method):
     assert np.abs(found.outputs - expected).max() <= 1e-8
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LINEAR)
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 2, 1, 0), (2, 0, 3, 1)])
 def test_blocks_sampled_at_one_instant_pass_on_at_once(order, method):
     """Three gains in a row, the middle one half as often: at common instants all three are new, and a lag of a
@@ -154,7 +155,7 @@ def test_blocks_sampled_at_one_instant_pass_on_at_once(order, method):
     assert np.abs(found.outputs - np.array(rows).T).max() <= 1e-9
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LINEAR)
 def test_a_discrete_block_without_feedthrough_delays_by_a_sample(method):
     late = ct.ss(0.0, 1.0, 1.0, 0.0, 0.5, inputs="e", outputs="u", name="late")
     first = cp.sample_hold(gain(1.0, "r", "e", "first"), 0.5)
@@ -166,7 +167,7 @@ def test_a_discrete_block_without_feedthrough_delays_by_a_sample(method):
     assert np.abs(found.outputs - [now, np.maximum(now - 0.5, 0.0)]).max() <= 1e-12
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LINEAR)
 def test_sampled_blocks_in_a_loop_at_one_instant(method):
     """u = r + w/2 and w = u/2: u = 4 r/3."""
     one = cp.sample_hold(gain([1.0, 0.5], ["r", "w"], "u", "one"), 0.5)
@@ -253,7 +254,7 @@ def test_events_and_stops_in_a_sampled_loop():
     law = gain([1.0, -1.0], ["r", "y"], "u", "law")
     integrator = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="y", name="integrator")
     loop = ct.interconnect([integrator, cp.sample_hold(law, 0.5)], inputs="r", outputs="y")
-    for method in METHODS:
+    for method in LINEAR:
         events = [Event("y", high=0.25, name="early"), Event("y", high=0.6, stop=True)]
         found = cp.simulate(loop, [0.0, 0.5, 3.0], 1.0, method=method, events=events)
         assert np.abs([o.time - t for o, t in zip(found.events, (0.25, 0.7), strict=True)]).max() <= 1e-7
@@ -271,11 +272,18 @@ def test_what_the_peer_says_to_such_a_loop():
         ct.input_output_response(late, [0.0, 1.0], 0, [1.0, 0.0])
 
 
-@pytest.mark.parametrize("system", ["sampled", "delayed"])
-def test_the_exact_method_rejects_them(system):
-    block = cp.sample_hold(gain(1.0, "r", "y", "b"), 0.5) if system == "sampled" else cp.create_delay_iosystem(0.5)
-    with pytest.raises(ValueError, match=r'method "exact".*block (b is sampled|delay is a delay)'):
-        cp.simulate(block, [0.0, 1.0], 1.0, method="exact")
+@pytest.mark.parametrize(
+    ("system", "reason"),
+    [
+        ("delayed", "block delay0 is a delay of a continuous signal for continuous blocks"),
+        ("sampled", "block b, which is sampled, is not linear"),
+    ],
+)
+def test_the_exact_method_rejects_them(system, reason):
+    bent = ct.nlsys(None, lambda t, x, u, p: np.tanh(u), inputs="r", outputs="y", dt=0.5, name="b")
+    block = cp.sample_hold(bent, 0.5) if system == "sampled" else integrators([1.0], [-1.0])
+    with pytest.raises(ValueError, match=f'method "exact".*{reason}'):
+        cp.simulate(block, [0.0, 1.0], 1.0 if system == "sampled" else None, method="exact")
 
 
 HELD = ct.ss(0.5, 1.0, 1.0, 0.0, 0.1, name="held")
@@ -459,7 +467,7 @@ def test_a_delay_in_a_saturated_loop(method):
     assert np.abs(found.outputs - exact).max() <= 1e-5
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LINEAR)
 @pytest.mark.parametrize("alpha", [0.0, 2.0])
 @pytest.mark.parametrize("delay", [0.25, math.pi / 3])
 def test_a_delayed_plan_is_the_plan_later(delay, alpha, method):
@@ -475,7 +483,7 @@ def test_a_delayed_plan_is_the_plan_later(delay, alpha, method):
         assert np.abs(found - plan.shift(delay)(times)).max() <= 1e-9
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LINEAR)
 def test_what_is_output_before_anything_has_come_through(method):
     late = cp.create_delay_iosystem(0.7, inputs=["a", "b"], outputs=["c", "d"], initial=[3.0, -2.0])
     times = np.array([0.0, 0.3, 0.7 - 1e-9, 0.7 + 1e-9, 1.0, 2.0])
@@ -483,7 +491,7 @@ def test_what_is_output_before_anything_has_come_through(method):
     assert np.abs(found.outputs - [[3, 3, 3, 1, 1, 1], [-2, -2, -2, 0, 5, 5]]).max() <= 1e-12
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LINEAR)
 def test_a_jump_passes_at_its_time(method):
     """Through two delays in a row, 1.15 s after 0.3 s, and into an integrator: a ramp from 1.45 s on."""
     one, two = (
@@ -535,7 +543,7 @@ def test_two_rounds_without_a_common_measure():
     assert np.abs(found.outputs.ravel() - exact).max() <= 1e-12
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LINEAR)
 def test_a_sampled_law_whose_control_comes_late(method):
     """u = -x/2 taken every 0.5 s comes 0.2 s later: straight lines, their slopes one behind the other."""
     law = cp.sample_hold(gain(-0.5, "x", "u_cmd", "law"), 0.5)

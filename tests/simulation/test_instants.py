@@ -10,7 +10,7 @@ from repetitions import examples
 import ctrlplan as cp
 
 EPS = np.finfo(float).eps
-METHODS = ["compiled", "python"]
+METHODS = ["exact", "compiled", "python"]
 
 
 def held(period, offset=0.0):

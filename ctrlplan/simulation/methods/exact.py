@@ -14,11 +14,18 @@ from ctrlplan.simulation.exact import Jet, exact_states, sampled_states
 from ctrlplan.simulation.job import Job, Record, with_event_times
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.prepared import Prepared
+from ctrlplan.simulation.sampled_form import SampledForm
+from ctrlplan.simulation.sampled_motion import moved_signals
+from ctrlplan.simulation.segments import check_periods
 from ctrlplan.simulation.signals import PlanSignal, SampledSignal, signal_values
 from ctrlplan.trajectories import Trajectory
 
 _UNCERTAIN = 1e-6
 """Uncertainty of an output, relative to its magnitude, above which it is reported."""
+
+
+_GROWTH = 1e6
+"""Growth of a perturbation over a run of a loop with discrete blocks above which its uncertainty is determined."""
 
 
 class Exact:
@@ -27,15 +34,56 @@ class Exact:
     name = "exact"
 
     def why_not(self, prepared: Prepared) -> str:
-        """Block that is not linear or not continuous; empty if there is none."""
-        return "" if prepared.linear is not None else prepared.not_linear
+        """Block that is not linear; empty if there is none."""
+        return "" if prepared.linear is not None or prepared.sampled is not None else prepared.not_sampled
 
     def run(self, job: Job) -> Record:
-        """States at the times of a job, to rounding errors."""
-        form = job.prepared.linear
-        if form is None:
-            raise TypeError(f"{job.prepared.name} must be linear and continuous, but {job.prepared.not_linear}")
-        return _run(job, form)
+        """States at the times of a job, to rounding errors.
+
+        Raises
+        ------
+        SolverError
+            If the states of a loop with discrete blocks overflow.
+        """
+        prepared = job.prepared
+        if prepared.linear is not None:
+            return _run(job, prepared.linear)
+        if prepared.sampled is not None:
+            return _run_sampled(job, prepared.sampled)
+        raise TypeError(f"{prepared.name} must be linear, but {prepared.not_sampled}")
+
+
+def _run_sampled(job: Job, form: SampledForm) -> Record:
+    """Record of a linear loop with discrete blocks."""
+    last, n = float(job.times[-1]), form.nstates
+    check_periods([job.blocks.blocks[i] for i in job.blocks.blocks_with("period")], job.first, last)
+    given = job.prepared.time_signals(job.inputs, job.first)
+    time_signals, motion = moved_signals(form, given, job.first, last, job.state)
+    watched = job.watched()
+    times = job.times
+    if watched:
+        times = with_event_times(times, watched, lambda: form.a[:, form.moving])
+        times = np.union1d(times, motion.instants.times)
+
+    def snapshot(t: Array, x: Array) -> Snapshot:
+        z, w = np.concatenate([x, motion.registers_at(t)]), signal_values(time_signals, t)
+
+        def signals() -> Array:
+            return np.asarray(form.signals_z @ z + form.signals_w @ w)
+
+        return Snapshot(t, x, w[: job.prepared.ninputs], form.c @ z + form.d @ w, signals)
+
+    def interpolate(k: int, t: float) -> Array:
+        return motion.at(np.array([t]))[:n, 0]
+
+    z = motion.at(times)
+    if motion.growth > _GROWTH:
+        nearly = moved_signals(form.perturbed(2.0**-50), given, job.first, last, job.state)[1].at(times)
+        w = signal_values(time_signals, times)
+        floor = 64.0 * np.finfo(float).eps * (np.abs(form.c) @ np.abs(z) + np.abs(form.d) @ np.abs(w)).max(axis=1)
+        _warn_of_uncertainty(job, form.c @ z + form.d @ w, form.c @ nearly + form.d @ w, floor)
+    states = z[:n]
+    return Record(times, states, snapshot, interpolate, watched, Exact.name, "linear, with discrete blocks or delays")
 
 
 def _run(job: Job, form: LinearForm) -> Record:

@@ -1,0 +1,484 @@
+"""Exact states of a linear loop with discrete blocks: at its sample times by a recursion, in between by series.
+
+From instant to instant z+ = J (Phi z + gam) + K w, where gam is the response to the
+functions of time over the interval. These are evaluated at the Gauss nodes of all
+intervals together; where a breakpoint lies inside of an interval, at those of its
+parts. Whatever the position of a breakpoint, each side is read where it is valid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan._types import Array
+from ctrlplan.simulation.built_forms import NotApplicableError
+from ctrlplan.simulation.flow_kernel import REACH, FlowKernel, gauss_nodes, to_legendre
+from ctrlplan.simulation.instants import Instants, instants_of
+from ctrlplan.simulation.interpreted import SolverError
+from ctrlplan.simulation.recurrences import marched
+from ctrlplan.simulation.sampled_form import Late, SampledForm
+from ctrlplan.simulation.segments import time_tolerance, values_after
+from ctrlplan.simulation.signals import TimeSignal, signal_values
+
+_ORDERS = (3, 4, 6, 8, 12, 16)
+"""Numbers of Gauss nodes of an interval, until the functions of time are resolved."""
+
+_RESOLVED = 4e-16
+"""Last Legendre coefficients, relative to a signal, at which it counts as resolved."""
+
+_PROBES = 64
+"""Number of intervals in which the number of nodes is chosen first."""
+
+_PARTS = 2**12
+"""Maximum number of parts into which an interval is divided to resolve the functions of time."""
+
+_NOISE, _FALLING = 1e-11, 4.0
+"""Size of the last coefficients below which they are rounding, unless more nodes decrease them by this factor."""
+
+_KINDS = 64
+"""Number of different lengths of intervals up to which each is treated by itself."""
+
+_TOGETHER = 2**12
+"""Number of times whose matrices are computed together."""
+
+_INSTANTS = 5e6
+"""Maximum number of sample times of a run, whose states are stored."""
+
+_NEGLIGIBLE = 1e-18
+"""Terms of a series relative to the largest that are left out."""
+
+
+class LateSignal:
+    """Functions of time that have passed a delay.
+
+    Parameters
+    ----------
+    late : Late
+        The delay.
+    signals : sequence of TimeSignal
+        All functions of time of the loop; those of later delays have no effect.
+    z : ndarray
+        States at the start of the run, before samples.
+    first : float
+        Start of the run [s].
+    tolerance : float
+        Difference of times that counts as rounding [s].
+    """
+
+    def __init__(self, late: Late, signals: Sequence[TimeSignal], z: Array, first: float, tolerance: float) -> None:
+        self.width, self._late, self._first, self._tolerance = late.initial.size, late, first, tolerance
+        ends = np.cumsum([signal.width for signal in signals], dtype=int).tolist()
+        columns = [slice(end - signal.width, end) for signal, end in zip(signals, ends, strict=True)]
+        used = [k for k, own in enumerate(columns) if late.from_w[:, own].any()]
+        self._signals = [signals[k] for k in used]
+        self._weights = np.concatenate([np.zeros((self.width, 0)), *(late.from_w[:, columns[k]] for k in used)], axis=1)
+        self._firsts = [(float(first + offset), own @ z) for offset, own in late.firsts if (own @ z).any()]
+        self._marks = [first, *(end for end, _ in self._firsts)]
+        self.motion: SampledMotion | None = None
+
+    def breakpoints_between(self, t0: float, t1: float) -> Array:
+        """Start of the delayed signals, and their breakpoints after it."""
+        begin, end = max(t0 - self._late.delay, self._first), t1 - self._late.delay
+        later = (t for signal in self._signals for t in signal.breakpoints_between(begin, end) if t > self._first)
+        marks = np.unique([*self._marks, *later]) + self._late.delay
+        return marks[slice(*np.searchsorted(marks, [t0, t1]).tolist())]
+
+    def at(self, times: Array) -> Array:
+        """Values (width, ntime), right-continuous."""
+        out = np.repeat(self._late.initial[:, None], times.size, axis=1)
+        past = times - self._late.delay
+        passed = past >= self._first - self._tolerance
+        past = np.maximum(past[passed], self._first)
+        found = self._weights @ values_after(self._signals, past, self._tolerance)
+        for end, value in self._firsts:
+            found += value[:, None] * (past < end - self._tolerance)
+        if self._late.follows and self.motion is not None:
+            found += self._late.from_z @ self.motion.at(past)
+        out[:, passed] = found
+        return out
+
+    def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
+        """Values at origin + s, which lie between two breakpoints."""
+        return self.at(origin + s)
+
+    def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
+        """No bounds are known."""
+        free = np.full(self.width, np.inf)
+        return -free, free
+
+
+def moved_signals(
+    form: SampledForm, signals: Sequence[TimeSignal], first: float, last: float, state: Array
+) -> tuple[list[TimeSignal], SampledMotion]:
+    """Functions of time of a loop, those of delays in place of given ones, and the motion of the loop.
+
+    Parameters
+    ----------
+    form : SampledForm
+        The loop.
+    signals : sequence of TimeSignal
+        Inputs, then the outputs of sources and delays.
+    first, last : float
+        Start and end of the run [s].
+    state : ndarray, shape (nstates,)
+        State at the start, before samples.
+    """
+    z, found, lates = np.concatenate([state, form.registers]), list(signals), list[LateSignal]()
+    tolerance = time_tolerance(first, last)
+    begins = np.cumsum([0, *(signal.width for signal in signals)]).tolist()
+    for late in form.lates:
+        lates.append(LateSignal(late, found, z, first, tolerance))
+        found[begins.index(late.columns.start)] = lates[-1]
+    motion = SampledMotion(form, found, first, last, z)
+    for signal in lates:
+        signal.motion = motion
+    return found, motion
+
+
+class SampledMotion:
+    """States of a loop over a run.
+
+    Parameters
+    ----------
+    form : SampledForm
+        The loop.
+    signals : sequence of TimeSignal
+        Functions of time w, in the order of the form.
+    first, last : float
+        Start and end of the run [s].
+    z : ndarray, shape (nz,)
+        States at the start, before samples.
+
+    Attributes
+    ----------
+    instants : Instants
+        Sample times of the discrete blocks, and further times at which nothing is due.
+    states : ndarray, shape (ninstants, nz)
+        States at the instants, after samples.
+    tolerance : float
+        Difference of times that counts as rounding [s].
+    """
+
+    def __init__(self, form: SampledForm, signals: Sequence[TimeSignal], first: float, last: float, z: Array) -> None:
+        self.form, self.tolerance = form, time_tolerance(first, last)
+        self._signals = signals
+        fed = np.flatnonzero(form.b.any(axis=0))
+        self._fed = _Chosen(signals, fed)
+        count = sum((last - first) / float(period) for period, _ in form.timings)
+        if count > _INSTANTS:
+            raise NotApplicableError(f"{form.name} has {count:.3g} sample times, more than {_INSTANTS:.0e}")
+        instants = instants_of(form.timings, first, last, self.tolerance)
+        self._spans, self._values = _resolved(_Spans(instants, last, self._fed, self.tolerance), self._fed)
+        self.instants = self._spans.instants
+        self._held = np.setdiff1d(np.flatnonzero(form.a.any(axis=0)), form.moving)
+        order = self._values.shape[1] // max(1, fed.size)
+        self._kernel = FlowKernel(form.a[:, form.moving], form.a[:, self._held], form.b[:, fed], order)
+        with np.errstate(all="ignore"):
+            self._changes = self._kernel.over(self._spans.different)
+            self.states = self._run(z)
+
+    def at(self, times: Array) -> Array:
+        """States (nz, ntime) at times [s] of the run, after the samples of those times."""
+        spans, moving = self._spans, self.form.moving
+        which = self._spans_at(times)
+        z: Array = np.take(self.states.T, spans.interval[which], axis=1)
+        if not moving.size:
+            return z
+        since = times - spans.starts[which]
+        inside = since > self.tolerance
+        whole = inside & spans.whole[which]
+        if np.count_nonzero(np.bincount(spans.kinds[which[whole]], minlength=1)) > _KINDS:
+            whole[:] = False
+        x = np.take(self._starts, which, axis=0)
+        for some, states in ((whole, self._by_series), (inside & ~whole, self._by_nodes)):
+            if some.all():
+                x = states(which, since)
+            elif some.any():
+                x[some] = states(which[some], since[some])
+        z[moving] = x.T
+        return z
+
+    @property
+    def growth(self) -> float:
+        """Growth of a random perturbation of the states over the run, at most."""
+        matrices, kinds = self._steps
+        start = np.random.default_rng(0).standard_normal(matrices.shape[1])
+        free = marched(start, matrices, kinds, np.zeros((kinds.size, start.size)))
+        return float(np.abs(free).max(initial=0.0) / np.abs(start).max(initial=1.0))
+
+    def registers_at(self, times: Array) -> Array:
+        """States (nz - nstates, ntime) of the registers."""
+        return np.take(self.states[:, self.form.nstates :].T, self._spans.interval[self._spans_at(times)], axis=1)
+
+    def _spans_at(self, times: Array) -> NDArray[np.intp]:
+        """Spans that contain times [s], the later one at their ends."""
+        return np.maximum(np.searchsorted(self._spans.starts, times + self.tolerance, side="right") - 1, 0)
+
+    def _run(self, z: Array) -> Array:
+        """States (ninstants, nz) at the instants."""
+        form, instants, moving = self.form, self.instants, self.form.moving
+        masks, due = np.unique(instants.due, return_inverse=True)
+        jumps = [form.jump(int(mask)) for mask in masks]
+        read = _Chosen(self._signals, np.flatnonzero(np.any([k.any(axis=0) for _, k in jumps], axis=0)))
+        values = read.after(instants.times, self.tolerance).T
+        forced = np.empty((instants.times.size, z.size))
+        moved = self._forced()
+        for k, (jump, given) in enumerate(jumps):
+            own = due == k
+            forced[own] = values[own] @ given[:, read.columns].T
+            later = np.flatnonzero(own[1:])
+            forced[later + 1] += moved[later] @ jump[:, moving].T
+        pairs, kinds = np.unique(self._spans.length_of[:-1] * masks.size + due[1:], return_inverse=True)
+        matrices = np.empty((pairs.size, z.size, z.size))
+        for k, pair in enumerate(pairs.tolist()):
+            length, mask = divmod(pair, masks.size)
+            flow, n = np.eye(z.size), moving.size
+            flow[np.ix_(moving, moving)] += self._changes[length][:, :n]
+            flow[np.ix_(moving, self._held)] += self._changes[length][:, n : n + self._held.size]
+            matrices[k] = jumps[mask][0] @ flow
+        self._steps = matrices, kinds
+        found = marched(jumps[due[0]][0] @ z + forced[0], matrices, kinds, forced[1:])
+        if not np.isfinite(found).all():
+            at = instants.times[int(np.argmin(np.isfinite(found).all(axis=1)))]
+            raise SolverError(
+                f"states of {form.name} must stay finite up to {instants.times[-1]:g} s, got an overflow at {at:g} s"
+            )
+        return found
+
+    def _forced(self) -> Array:
+        """Responses (nintervals, nx) of the flow to functions of time over each interval, from zero."""
+        spans, n = self._spans, self.form.moving.size + self._held.size
+        found = np.zeros((self.instants.times.size, self.form.moving.size))
+        if not self._fed.columns.size:
+            return found
+        whole = np.flatnonzero(spans.whole)
+        if spans.different.size <= _KINDS:
+            for k, change in enumerate(self._changes):
+                own = whole[spans.kinds[whole] == k]
+                found[spans.interval[own]] = self._values[own] @ change[:, n:].T
+        else:
+            for own in np.array_split(whole, 1 + whole.size // _TOGETHER):
+                change = self._changes[spans.kinds[own], :, n:]
+                found[spans.interval[own]] = np.matmul(change, self._values[own, :, None])[..., 0]
+        found[spans.broken] = self._chained(np.zeros((spans.broken.size, n)))[1]
+        return found
+
+    @cached_property
+    def _starts(self) -> Array:
+        """States of the flow (nspans, nx) at the starts of all spans."""
+        spans = self._spans
+        found = self.states[spans.interval][:, self.form.moving]
+        known = self.states[spans.broken]
+        held = np.concatenate([known[:, self.form.moving], known[:, self._held]], axis=1)
+        found[~spans.whole] = self._chained(held)[0]
+        return found
+
+    def _chained(self, known: Array) -> tuple[Array, Array]:
+        """States at the starts of the parts of broken intervals, and at their ends, from states and held values."""
+        spans, nx = self._spans, self.form.moving.size
+        parts = np.flatnonzero(~spans.whole)
+        changes = self._kernel.over(spans.lengths[parts])
+        place = np.searchsorted(spans.broken, spans.interval[parts])
+        rank = np.arange(parts.size) - np.searchsorted(place, place)
+        state, held = known[:, :nx].copy(), known[:, nx:]
+        starts = np.empty((parts.size, nx))
+        for k in range(int(rank.max(initial=-1)) + 1):
+            own = np.flatnonzero(rank == k)
+            at = place[own]
+            starts[own] = state[at]
+            given = np.concatenate([state[at], held[at], self._values[parts[own]]], axis=1)
+            state[at] += np.matmul(changes[own], given[..., None])[..., 0]
+        return starts, state
+
+    def _known(self, which: NDArray[np.intp]) -> Array:
+        """States, held values and values at the nodes (n, width) of some spans."""
+        held = self.states[self._spans.interval[which]][:, self._held]
+        return np.concatenate([self._starts[which], held, self._values[which]], axis=1)
+
+    def series(self, which: NDArray[np.intp], kind: int, cell: int) -> Array:
+        """Chebyshev series (nspans, nterms, nx) of the flow in one cell of some intervals of equal length."""
+        length = float(self._spans.different[kind])
+        cells = self.cells(kind)
+        table = self._kernel.within(length, cell / cells, (cell + 1) / cells, self._kernel.terms(length / cells))
+        count, nx = table.shape[:2]
+        found: Array = (self._known(which) @ table.reshape(count * nx, -1).T).reshape(-1, count, nx)
+        found[:, 0] += self._starts[which]
+        size = np.abs(found).max(axis=0, initial=0.0)
+        used = np.flatnonzero(np.any(size > _NEGLIGIBLE * size.max(axis=0), axis=1))
+        return found[:, : int(used.max(initial=0)) + 1]
+
+    def cells(self, kind: int) -> int:
+        """Number of cells of an interval in which the flow is resolved by one series each."""
+        reach = self._kernel.norm * float(self._spans.different[kind])
+        return max(1, int(np.ceil(reach / REACH)))
+
+    def _by_series(self, which: NDArray[np.intp], since: Array) -> Array:
+        """States of the flow (ntime, nx) in whole intervals, times [s] after their starts."""
+        found = np.empty((since.size, self.form.moving.size))
+        kinds = self._spans.kinds[which]
+        for kind in np.flatnonzero(np.bincount(kinds)).tolist():
+            own = np.flatnonzero(kinds == kind)
+            place = since[own] * (self.cells(kind) / self._spans.different[kind])
+            cell = np.minimum(place.astype(np.intp), self.cells(kind) - 1)
+            for k in np.flatnonzero(np.bincount(cell)).tolist():
+                some = cell == k
+                inside = which[own[some]]
+                new = np.append(True, inside[1:] != inside[:-1])
+                series = self.series(inside[new], kind, k)
+                found[own[some]] = _evaluated(series, np.cumsum(new) - 1, 2.0 * (place[some] - k) - 1.0)
+        return found
+
+    def _by_nodes(self, which: NDArray[np.intp], since: Array) -> Array:
+        """The same in any spans, from values of the functions of time between their starts and each time."""
+        found = np.empty((since.size, self.form.moving.size))
+        nodes, nvalues = gauss_nodes(self._kernel.order), self._values.shape[1]
+        for own in np.array_split(np.arange(since.size), 1 + since.size // _TOGETHER):
+            spans, tau = which[own], since[own]
+            given = self._known(spans)
+            if nvalues:
+                times = self._spans.starts[spans, None] + tau[:, None] * nodes
+                given[:, -nvalues:] = self._fed.at(times)
+            found[own] = self._starts[spans] + np.matmul(self._kernel.over(tau), given[..., None])[..., 0]
+        return found
+
+
+class _Chosen:
+    """Some of the functions of time of a loop.
+
+    Attributes
+    ----------
+    columns : ndarray of int
+        Their places among all of them.
+    signals : list of TimeSignal
+        Signals that contain them.
+    """
+
+    def __init__(self, signals: Sequence[TimeSignal], columns: NDArray[np.intp]) -> None:
+        self.columns, self.signals = columns, list[TimeSignal]()
+        rows, width, begin = [np.zeros(0, dtype=np.intp)], 0, 0
+        for signal in signals:
+            own = columns[(columns >= begin) & (columns < begin + signal.width)]
+            if own.size:
+                self.signals.append(signal)
+                rows.append(own - begin + width)
+                width += signal.width
+            begin += signal.width
+        self._rows = np.concatenate(rows)
+
+    def breakpoints_between(self, t0: float, t1: float) -> Array:
+        """Times [s] between which they are analytic."""
+        return np.unique(np.concatenate([np.zeros(0), *(s.breakpoints_between(t0, t1) for s in self.signals)]))
+
+    def at(self, times: Array) -> Array:
+        """Values (nspans, ntime * ncolumns) at times (nspans, ntime), none of which is a breakpoint."""
+        found = signal_values(self.signals, times.ravel())[self._rows]
+        return found.T.reshape(len(times), -1)
+
+    def after(self, times: Array, tolerance: float) -> Array:
+        """Values (ncolumns, ntime) after breakpoints that follow within a tolerance."""
+        return values_after(self.signals, times, tolerance)[self._rows]
+
+
+class _Spans:
+    """Intervals between instants, in parts where a function of time is not analytic inside of one.
+
+    Attributes
+    ----------
+    instants : Instants
+        The instants; after the last one there is an interval up to the end of the run.
+    different : ndarray
+        Different lengths [s] of intervals.
+    length_of : ndarray of int, shape (ninstants,)
+        Index of the length of each interval.
+    interval, starts, lengths, whole : ndarray, shape (nspans,)
+        Interval, start [s] and length [s] of each span, and whether it is a whole interval.
+    kinds : ndarray of int, shape (nspans,)
+        Index of the length of the interval of each span.
+    broken : ndarray of int
+        Intervals that have parts.
+    """
+
+    def __init__(self, instants: Instants, last: float, fed: _Chosen, tolerance: float) -> None:
+        self.instants, self._last, self._fed, self.tolerance = instants, last, fed, tolerance
+        begin, end = instants.times, np.append(instants.times[1:], max(last, float(instants.times[-1])))
+        self.different = np.append(instants.lengths, end[-1] - begin[-1])
+        self.length_of = np.append(instants.which, instants.lengths.size)
+        marks = fed.breakpoints_between(float(begin[0]), float(end[-1]))
+        marks = marks[(marks > begin[0] + tolerance) & (marks < end[-1] - tolerance)]
+        marks = marks[np.append(True, np.diff(marks) > tolerance)[: marks.size]]
+        where = np.searchsorted(begin, marks, side="right") - 1
+        inside = (marks - begin[where] > tolerance) & (end[where] - marks > tolerance)
+        marks, where = marks[inside], where[inside]
+        self.broken = np.unique(where)
+        self.interval = np.concatenate([np.arange(begin.size), where])
+        self.starts = np.concatenate([begin, marks])
+        by = np.argsort(self.starts, kind="stable")
+        self.interval, self.starts = self.interval[by], self.starts[by]
+        self.lengths = np.append(self.starts[1:], end[-1]) - self.starts
+        self.whole = ~np.isin(self.interval, self.broken)
+        self.kinds = self.length_of[self.interval]
+        self.lengths[self.whole] = self.different[self.kinds[self.whole]]
+
+    def divided(self, parts: int) -> _Spans:
+        """The same with each interval divided into equal ones."""
+        return _Spans(self.instants.divided(parts), self._last, self._fed, self.tolerance)
+
+
+def _resolved(spans: _Spans, fed: _Chosen) -> tuple[_Spans, Array]:
+    """Spans, divided if necessary, and values (nspans, order * ncolumns) at Gauss nodes that resolve the signals."""
+    if not fed.columns.size:
+        return spans, np.zeros((spans.starts.size, 0))
+    parts, divided = 1, spans
+    while True:
+        used = np.flatnonzero(divided.lengths > divided.tolerance)
+        some = used[np.unique(np.linspace(0, used.size - 1, min(_PROBES, used.size)).astype(int))]
+        longest = used[np.argsort(-divided.lengths[used])[:_PROBES]]
+        orders = _orders(divided, fed, np.union1d(some, longest), _ORDERS)
+        for order in orders:
+            values = fed.at(divided.starts[:, None] + divided.lengths[:, None] * gauss_nodes(order))
+            if _tail(values, order) <= _RESOLVED or order == orders[-1]:
+                return divided, values
+        if parts >= _PARTS:
+            raise NotApplicableError("a function of time is not resolved between the sample times of the loop")
+        parts *= 2
+        divided = spans.divided(parts)
+
+
+def _orders(spans: _Spans, fed: _Chosen, some: NDArray[np.intp], orders: Sequence[int]) -> list[int]:
+    """Numbers of nodes from the first that resolves the signals in some spans on; none if there is none."""
+    before = np.inf
+    for k, order in enumerate(orders):
+        tail = _tail(fed.at(spans.starts[some, None] + spans.lengths[some, None] * gauss_nodes(order)), order)
+        if tail <= _RESOLVED:
+            return list(orders[k:])
+        if (
+            before <= _NOISE and tail > before / _FALLING
+        ):  # rounding errors of the signals, which more nodes do not reduce
+            return [orders[k - 1]]
+        before = tail
+    return []
+
+
+def _tail(values: Array, order: int) -> float:
+    """Last two Legendre coefficients relative to the largest value of each signal, at most."""
+    nodes = values.reshape(len(values), order, -1)
+    last = np.abs(np.einsum("pf,kfm->kpm", to_legendre(order)[-2:], nodes)).max(axis=(0, 1), initial=0.0)
+    size = np.abs(nodes).max(axis=(0, 1), initial=0.0)
+    return float((last / np.where(size > 0.0, size, 1.0)).max(initial=0.0))
+
+
+def _evaluated(series: Array, row: NDArray[np.intp], x: Array) -> Array:
+    """Values (ntime, nx) of Chebyshev series (nspans, nterms, nx) in some rows at places from -1 to 1."""
+    count, nx = series.shape[1:]
+    basis = np.empty((count, x.size))
+    basis[:1], basis[1:2] = 1.0, x
+    for j in range(2, count):
+        basis[j] = 2.0 * x * basis[j - 1] - basis[j - 2]
+    found = np.empty((x.size, nx))
+    for own in np.array_split(np.arange(x.size), 1 + x.size // _TOGETHER):
+        np.einsum("tjn,jt->tn", series[row[own]], basis[:, own], out=found[own[0] : own[-1] + 1] if own.size else None)
+    return found
