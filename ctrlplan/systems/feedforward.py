@@ -17,7 +17,7 @@ from ctrlplan.systems.feedforward_discrete import discrete_feedforward
 from ctrlplan.systems.feedforward_inverse import loop_inverse
 from ctrlplan.systems.feedforward_planned import PlanOptions, planned_feedforward
 from ctrlplan.systems.feedforward_sampled import is_sampled, sampled_feedforward
-from ctrlplan.systems.feedforward_zeros import ON_AXIS, eigenvalues, zero_list
+from ctrlplan.systems.feedforward_zeros import eigenvalues, largest_size, tolerance, zero_list
 from ctrlplan.trajectories import Trajectory, derivative_name
 
 
@@ -175,6 +175,22 @@ def create_feedforward_iosystem(
     >>> found = cp.simulate(following, times)
     >>> bool(abs(found.outputs["y"] - plan(times)).max() < 1e-6)
     True
+
+    A digital PI controller of a lag, sampled every 20 ms: the command starts one
+    sample before the plan, and the output is that of the plan at the samples.
+
+    >>> gains = [[1.0]], [[0.04, -0.04]], [[1.0]], [[3.0, -3.0]]
+    >>> controller = ct.ss(*gains, 0.02, inputs=["r", "y"], outputs="u", name="controller")
+    >>> plant = ct.tf([1], [1, 1], inputs="u", outputs="y", name="plant")
+    >>> loop = ct.interconnect([cp.sample_hold(controller, 0.02), plant], inputs="r", outputs="y", name="loop")
+    >>> feedforward = cp.create_feedforward_iosystem(loop, plan=plan)
+    >>> print(feedforward)
+    PlannedFeedforward of r from -0.02 s
+      preview                 0.02 s before the plan
+      method                  exact
+      zeros of the loop       0.9867
+      error                   0 of the move
+      ripple between samples  0.0003339
     """
     options = _checked_options(plan, error, preview, method, finite)
     if plan is None:
@@ -250,8 +266,8 @@ def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
 
 def _check_zeros(zeros: NDArray[np.complex128], a: Array) -> None:
     """Raise unless all zeros are in the left half plane."""
-    size = float(np.abs(np.concatenate([eigenvalues(a), zeros])).max(initial=0.0))
-    if (zeros.real < -ON_AXIS * size).all():
+    size = largest_size(eigenvalues(a), zeros)
+    if all(zero.real < -tolerance(zero, size) for zero in zeros):
         return
     raise ValueError(
         f"loop must have its zeros in the left half plane, got {zero_list(zeros)}: the command would grow without "

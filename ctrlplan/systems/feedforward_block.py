@@ -96,6 +96,9 @@ class PlannedFeedforward(Displayed, ct.InterconnectedSystem):  # type: ignore[mi
             outputs=list(outputs),
             name=name,
         )
+        for value in vars(known).values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
         self.__dict__.update(vars(known))
         self._outputs = tuple(outputs)
         for block in (inverse, self):

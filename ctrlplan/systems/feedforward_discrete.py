@@ -13,8 +13,8 @@ from ctrlplan._types import Array
 from ctrlplan.systems.feedforward_block import Accuracy, PlannedFeedforward
 from ctrlplan.systems.feedforward_inverse import Inverse, loop_inverse
 from ctrlplan.systems.feedforward_planned import (
-    Left,
     PlanOptions,
+    Remainder,
     Start,
     check_ends,
     check_growth,
@@ -121,12 +121,12 @@ def discrete_command(loop: ct.StateSpace, plan: Trajectory, options: PlanOptions
         _check_ringing(zeros)
     reference = Reference(plan, dt, uncancelled)
     inverse = loop_inverse(inverted)
-    parts = separation(inverse.z, np.append(eigenvalues(loop.A), 1.0), _outside)
+    parts = separation(inverse.z, 1.0, _outside)
     start = equilibrium(inverted, inverse, parts, plan.initial, 1.0)
     lead = max(inverse.orders)
     rows = reference.rows(-lead, inverse.orders)  # from sample -lead of the plan to its end
-    left = [_left(group, inverse, start, rows) for group in parts.boundary]
-    check_growth(left, parts, plan.end, options.finite)
+    left = [_remainder(group, inverse, start, rows) for group in parts.boundary]
+    check_growth(left, plan.end, options.finite)
     ahead = _ahead(loop, inverse, parts, start, rows, plan, options, lead)
     values = np.vstack([parts.rest.left @ inverse.k @ ahead.rows, inverse.d @ ahead.rows])
     values[len(parts.rest.z) :] += inverse.c @ parts.unstable.right @ ahead.states
@@ -191,7 +191,7 @@ def _ahead(
     lead: int,
 ) -> _Ahead:
     """Preview that the zeros outside of the unit circle require."""
-    stable, unstable = not grows(loop.A, _outside), parts.unstable
+    stable, unstable = not grows(loop.A, 1.0, _outside), parts.unstable
     given = None if options.preview is None else max(math.ceil(options.preview / loop.dt - 1e-6) - lead, 0)
     count, error, state, states = given or 0, 0.0, start.loop, np.zeros((0, rows.shape[1]))
     if unstable.z.size:
@@ -218,7 +218,7 @@ def _backward(z: Array, given: Array) -> Array:
     return np.array(states[::-1]).T
 
 
-def _left(group: Boundary, inverse: Inverse, start: Start, rows: Array) -> Left:
+def _remainder(group: Boundary, inverse: Inverse, start: Start, rows: Array) -> Remainder:
     """Motion of zeros on the unit circle after the plan."""
     given, state = group.left @ inverse.k @ rows, group.left @ start.internal
     largest = np.abs(state)

@@ -15,13 +15,14 @@ from ctrlplan.systems.feedforward_inverse import Inverse, loop_inverse
 from ctrlplan.systems.feedforward_preview import continuous_motion, preview_of
 from ctrlplan.systems.feedforward_states import Dynamics, unstable_states
 from ctrlplan.systems.feedforward_zeros import (
-    ON_AXIS,
     Boundary,
     ComplexArray,
     Separation,
     eigenvalues,
     grows,
+    largest_size,
     separation,
+    tolerance,
     zero_list,
 )
 from ctrlplan.systems.source import PlanSource
@@ -51,14 +52,15 @@ def planned_feedforward(loop: ct.StateSpace, plan: Trajectory, options: PlanOpti
         raise ValueError(f'method must be "exact" for a loop in continuous time, got {options.method!r}')
     inverse, poles = loop_inverse(loop), eigenvalues(loop.A)
     _check_smooth(plan, inverse.orders, loop.output_labels)
-    parts = separation(inverse.z, poles, _real_part)
+    size = largest_size(poles, eigenvalues(inverse.z))
+    parts = separation(inverse.z, size, _real_part)
     if parts.boundary or parts.unstable.z.size:
         check_ends(plan)
     start = equilibrium(loop, inverse, parts, plan.initial, 0.0)
-    left = [_left(group, inverse, plan, start, parts.size) for group in parts.boundary]
-    check_growth(left, parts, plan.end, options.finite)
+    left = [_remainder(group, inverse, plan, start, size) for group in parts.boundary]
+    check_growth(left, plan.end, options.finite)
     sources = [PlanSource(plan, max(inverse.orders), f"{name}_plan", plan.labels)]
-    preview, error, stable, state = options.preview or 0.0, 0.0, not grows(loop.A, _real_part), start.loop
+    preview, error, stable, state = options.preview or 0.0, 0.0, not grows(loop.A, size, _real_part), start.loop
     if parts.unstable.z.size:
         states = unstable_states(_dynamics(parts.unstable.z, parts.unstable.left, inverse, plan))
         shape = inverse.states @ parts.unstable.right
@@ -162,7 +164,7 @@ def _check_smooth(plan: Trajectory, orders: list[int], outputs: list[str]) -> No
 
 
 @dataclass(frozen=True, eq=False)
-class Left:
+class Remainder:
     """Motion that equal zeros on the stability boundary leave behind at the end of a plan.
 
     Attributes
@@ -189,7 +191,7 @@ def motion_left(
     c: Array,
     shift: float,
     size: float,
-) -> Left:
+) -> Remainder:
     """Motion of a group of zeros after a plan.
 
     Parameters
@@ -208,17 +210,17 @@ def motion_left(
         Magnitude of the largest pole or zero.
     """
     inner = group.z - shift * np.eye(len(end))
-    if abs(group.zero - shift) <= ON_AXIS * size:
+    if abs(group.zero - shift) <= tolerance(shift, size):
         motion, scale = inner @ end + held, np.abs(inner) @ largest + terms
-        return Left(group, np.zeros(len(c)), bool(np.any(np.abs(motion) > _GROWS * scale)))
+        return Remainder(group, np.zeros(len(c)), bool(np.any(np.abs(motion) > _GROWS * scale)))
     departure = end + np.linalg.solve(inner, held)
     nilpotent = group.z - group.zero * np.eye(len(end))
-    growing = np.abs(nilpotent @ departure) > _GROWS * size * largest
+    growing = np.abs(nilpotent @ departure) > tolerance(group.zero, size) * largest
     factor = 2.0 if group.zero.imag else 1.0
-    return Left(group, factor * np.abs(c @ group.right @ departure), bool(growing.any()))
+    return Remainder(group, factor * np.abs(c @ group.right @ departure), bool(growing.any()))
 
 
-def check_growth(left: Sequence[Left], parts: Separation, end: float, finite: bool) -> None:
+def check_growth(left: Sequence[Remainder], end: float, finite: bool) -> None:
     """Raise if the command grows after the plan, unless it is used up to its end only."""
     growing = [zero for one in left if one.grows for zero in one.group.members]
     if growing and not finite:
@@ -231,7 +233,7 @@ def check_growth(left: Sequence[Left], parts: Separation, end: float, finite: bo
         )
 
 
-def oscillations(left: Sequence[Left], dt: float | None = None) -> tuple[tuple[float, Array], ...]:
+def oscillations(left: Sequence[Remainder], dt: float | None = None) -> tuple[tuple[float, Array], ...]:
     """Frequency [rad/s] and amplitudes of each bounded oscillation that remains."""
     found = []
     for one in left:
@@ -241,7 +243,7 @@ def oscillations(left: Sequence[Left], dt: float | None = None) -> tuple[tuple[f
     return tuple(found)
 
 
-def _left(group: Boundary, inverse: Inverse, plan: Trajectory, start: Start, size: float) -> Left:
+def _remainder(group: Boundary, inverse: Inverse, plan: Trajectory, start: Start, size: float) -> Remainder:
     dynamics = _dynamics(group.z, group.left, inverse, plan)
     end, seen = dynamics.forward(group.left @ start.internal)
     extrema = plan.extrema()

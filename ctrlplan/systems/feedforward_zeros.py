@@ -19,11 +19,17 @@ ComplexArray = NDArray[np.complex128]
 Distance: TypeAlias = Callable[[complex], float]
 """Signed distance of a pole or zero from the stability boundary, positive if it is unstable."""
 
-ON_AXIS = 1e-8
-"""Distance from the stability boundary, relative to the largest pole or zero, up to which a zero is on it."""
+_ON_BOUNDARY = 1e-8
+"""Distance from the stability boundary, relative to the zero itself, up to which a zero is on it."""
+
+_UNCERTAIN = 1e-10
+"""The same relative to the largest pole or zero, whose rounding errors move the others."""
 
 _NILPOTENT = 1e-10
 """Relative size of a power of a matrix that counts as 0."""
+
+_ROUNDED = 1e-13
+"""Rounding error of a power relative to the largest pole or zero."""
 
 _APART = 4.0
 """Ratio of the magnitudes of zeros from which on they are decoupled."""
@@ -141,13 +147,13 @@ def boundary_zeros(z: Array, zeros: ComplexArray, size: float, distance: Distanc
         for zero in zeros:
             near = np.argsort(np.abs(zeros - zero), kind="stable")[:k]
             mean = complex(zeros[near].mean())
-            if not free[near].all() or abs(distance(mean)) > ON_AXIS * size:
+            if not free[near].all() or abs(distance(mean)) > tolerance(mean, size):
                 continue
             group = _group(z, zeros, near, mean)
-            if group is None or not _is_small_or_nilpotent(group.z - mean * np.eye(k), size):
+            if group is None or not _is_small_or_nilpotent(group.z - mean * np.eye(k), mean, size):
                 continue
             free[near] = False
-            if abs(mean.imag) <= ON_AXIS * size:
+            if abs(mean.imag) <= tolerance(mean, size):
                 found.append(replace(group, zero=complex(mean.real)))
             elif mean.imag > 0.0:
                 found.append(group)
@@ -163,7 +169,7 @@ class Separation:
     zeros : ndarray of complex
         All zeros.
     size : float
-        Magnitude of the largest pole or zero.
+        Magnitude of the largest pole or zero; 1 for difference equations.
     boundary : list of Boundary
         Groups of zeros on the stability boundary.
     unstable, rest : Part
@@ -177,10 +183,12 @@ class Separation:
     rest: Part
 
 
-def separation(z: Array, poles: ComplexArray, distance: Distance) -> Separation:
-    """Separation of the internal dynamics z of a loop with given poles."""
+def separation(z: Array, size: float, distance: Distance) -> Separation:
+    """Separation of the internal dynamics z of a loop whose largest pole has a given magnitude.
+
+    For difference equations the size is 1, the radius of the boundary.
+    """
     zeros = eigenvalues(z)
-    size = float(np.abs(np.concatenate([poles, zeros])).max(initial=0.0))
     groups = boundary_zeros(z, zeros, size, distance)
     unstable, rest = separated(whole(z), _unstable_test(zeros, groups, distance))
     return Separation(zeros, size, groups, decoupled(unstable), rest)
@@ -191,13 +199,22 @@ def eigenvalues(matrix: Array) -> ComplexArray:
     return np.linalg.eigvals(matrix).astype(complex) if matrix.size else np.zeros(0, dtype=complex)
 
 
-def grows(a: Array, distance: Distance) -> bool:
+def tolerance(zero: complex, size: float) -> float:
+    """Distance that counts as rounding for a zero, where the largest pole or zero has a given magnitude."""
+    return _ON_BOUNDARY * abs(zero) + _UNCERTAIN * size
+
+
+def largest_size(*values: ComplexArray) -> float:
+    """Largest magnitude of poles and zeros."""
+    return float(np.abs(np.concatenate(values)).max(initial=0.0))
+
+
+def grows(a: Array, size: float, distance: Distance) -> bool:
     """Whether free motions of a system grow: by unstable poles, or multiple ones on the boundary."""
     poles = eigenvalues(a)
-    size = float(np.abs(poles).max(initial=0.0))
     groups = boundary_zeros(a, poles, size, distance)
     is_unstable = _unstable_test(poles, groups, distance)
-    multiple = (np.linalg.norm(one.z - one.zero * np.eye(len(one.z))) > ON_AXIS * size for one in groups)
+    multiple = (np.linalg.norm(one.z - one.zero * np.eye(len(one.z))) > tolerance(one.zero, size) for one in groups)
     return any(map(is_unstable, poles)) or any(multiple)
 
 
@@ -236,9 +253,11 @@ def _coupling(t: NDArray[np.inexact], count: int) -> NDArray[np.inexact]:
     return np.asarray(solve_sylvester(t[:count, :count], -t[count:, count:], -t[:count, count:]))
 
 
-def _is_small_or_nilpotent(matrix: ComplexArray, size: float) -> bool:
-    """Whether a matrix, or a power of it, is 0 up to rounding."""
+def _is_small_or_nilpotent(matrix: ComplexArray, zero: complex, size: float) -> bool:
+    """Whether the part of equal zeros, minus the zero, or a power of it, is 0 up to rounding."""
     norm = float(np.linalg.norm(matrix))
-    if norm <= ON_AXIS * size:
+    if norm <= tolerance(zero, size):
         return True
-    return bool(np.linalg.norm(np.linalg.matrix_power(matrix / norm, len(matrix))) <= _NILPOTENT)
+    # Rounding moves entries by 1e-16 of the largest pole or zero, of which the power has a multiple.
+    limit = max(_NILPOTENT, _ROUNDED * size / norm)
+    return bool(np.linalg.norm(np.linalg.matrix_power(matrix / norm, len(matrix))) <= limit)

@@ -130,6 +130,15 @@ def test_a_zero_at_1_holds_no_output():
         cp.create_feedforward_iosystem(loop, plan=move(initial=1.0, final=2.0))
 
 
+def test_a_slow_zero_inside_is_told_from_one_on_the_circle_if_another_is_far():
+    num = np.poly([-1e5, 0.99995])
+    loop = ct.ss(ct.tf(num / num.sum(), [1, 0, 0, 0], 0.01), inputs="r", outputs="y", name="loop")
+    block, _, _, error = followed(loop, move(), 2.0, 0.01)
+    np.testing.assert_allclose(np.sort(block.zeros.real), [-1e5, 0.99995], rtol=1e-9)
+    assert block.remaining == ()
+    assert error.max() < 1e-8
+
+
 # Bands
 
 

@@ -287,6 +287,20 @@ def test_a_loop_that_holds_no_output_starts_at_0():
         cp.create_feedforward_iosystem(tf([1, 0], [1, 2, 1]), plan=bump(1.0, initial=2.0))
 
 
+@pytest.mark.parametrize("far", [-1e6, -1e8])
+def test_a_slow_zero_is_told_from_one_on_the_axis_if_another_is_fast(far):
+    slow = np.poly([-0.05, far]) / abs(far)
+    block = cp.create_feedforward_iosystem(ct.ss(tf(slow, [1, 6, 11, 6])))
+    np.testing.assert_allclose(np.sort(block.poles().real), [far, -0.05], rtol=1e-7)
+    pair = np.poly([0.3j, -0.3j, far]).real / abs(far)
+    block, _, _, error = followed(tf(pair, np.poly([-1, -2, -3, -4])), bump(1.0), after=5.0)
+    assert [frequency for frequency, _ in block.remaining] == pytest.approx([0.3], rel=1e-7)
+    assert error[0] < 1e-8
+    double = tf(np.poly([3j, -3j, 3j, -3j, far]).real / abs(far), np.poly(-np.arange(1.0, 7.0)))
+    with pytest.raises(ValueError, match=r"^plan must leave the motion of zeros of loop at .*3j bounded"):
+        cp.create_feedforward_iosystem(double, plan=bump(1.0))
+
+
 # Unstable loops
 
 
