@@ -196,6 +196,7 @@ def create_feedforward_iosystem(
     if plan is None:
         return _block_of(loop, labels, suffix, name)
     if is_sampled(loop):
+        _check_square(loop)
         return sampled_feedforward(loop, _matched(plan, labels, loop), options, name)
     system = _checked_loop(loop)
     following = _matched(plan, labels, loop)
@@ -251,8 +252,7 @@ _LATER = "the command depends on later samples of the plan"
 def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
     if not isinstance(loop, ct.StateSpace | ct.TransferFunction):
         raise TypeError(f"loop must be linear, a StateSpace or TransferFunction, got {type(loop).__name__}")
-    if loop.ninputs != loop.noutputs or not loop.ninputs:
-        raise ValueError(f"loop must have as many inputs as outputs, got {loop.ninputs} and {loop.noutputs}")
+    _check_square(loop)
     fraction = isinstance(loop, ct.TransferFunction)
     if fraction and loop.ninputs > 1:
         raise TypeError("loop with several inputs must be a StateSpace, got a TransferFunction; use control.ss")
@@ -262,6 +262,11 @@ def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
     if fraction and given[0].size > given[1].size:
         raise ValueError("loop must be proper, got a numerator of higher degree than the denominator")
     return ct.ss(loop) if fraction else loop
+
+
+def _check_square(loop: System) -> None:
+    if loop.ninputs != loop.noutputs or not loop.ninputs:
+        raise ValueError(f"loop must have as many inputs as outputs, got {loop.ninputs} and {loop.noutputs}")
 
 
 def _check_zeros(zeros: NDArray[np.complex128], a: Array) -> None:

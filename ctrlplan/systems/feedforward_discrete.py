@@ -23,7 +23,7 @@ from ctrlplan.systems.feedforward_planned import (
     oscillations,
 )
 from ctrlplan.systems.feedforward_preview import discrete_motion, preview_of
-from ctrlplan.systems.feedforward_reference import Reference, held_samples
+from ctrlplan.systems.feedforward_reference import MAXIMUM, Reference, held_samples
 from ctrlplan.systems.feedforward_zeros import (
     Boundary,
     ComplexArray,
@@ -193,12 +193,19 @@ def _ahead(
     """Preview that the zeros outside of the unit circle require."""
     stable, unstable = not grows(loop.A, 1.0, _outside), parts.unstable
     given = None if options.preview is None else max(math.ceil(options.preview / loop.dt - 1e-6) - lead, 0)
+    if given is not None and given > MAXIMUM:
+        raise ValueError(f"preview must be at most {MAXIMUM} samples of {loop.dt:g} s, got {options.preview:g} s")
     count, error, state, states = given or 0, 0.0, start.loop, np.zeros((0, rows.shape[1]))
     if unstable.z.size:
         states = _backward(unstable.z, unstable.left @ inverse.k @ rows)
         still, shape = unstable.left @ start.internal, inverse.states @ unstable.right
         motion = discrete_motion(loop, stable, unstable.z, shape, states[:, 0] - still, plan)
         preview, error = preview_of(motion, options.error, given, eigenvalues(loop.A), stable)
+        if preview > MAXIMUM:
+            raise ValueError(
+                f"zeros of loop outside of the unit circle must require at most {MAXIMUM} samples of preview, got "
+                f"{preview:.3g} for {zero_list(unstable.zeros)}; sample more slowly, or give a shorter preview="
+            )
         count, state = int(preview), start.loop + shape @ motion.state(preview)
         back, before = np.linalg.inv(unstable.z), [states[:, 0] - still]
         for _ in range(count):

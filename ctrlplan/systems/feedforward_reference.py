@@ -13,8 +13,8 @@ from ctrlplan.systems.feedforward_zeros import ComplexArray
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.internal import InternalTrajectory
 
-_MOST = 5_000_000
-"""Maximum number of samples of a plan."""
+MAXIMUM = 5_000_000
+"""Maximum number of samples of a plan, or of a preview."""
 
 _ENERGY = 0.999
 """Part of the energy of a plan's velocity below its highest frequency."""
@@ -48,9 +48,9 @@ class Reference:
         self._plan, self._dt = plan, dt
         self._factor = np.atleast_1d(np.real(np.poly(zeros))) / np.prod(1.0 - zeros).real
         self._filtered = self._factor.size > 1
-        if plan.duration > _MOST * dt:
+        if plan.duration > MAXIMUM * dt:
             raise ValueError(
-                f"plan must have at most {_MOST} samples, got {plan.duration:g} s with a sampling time of {dt:g} s"
+                f"plan must have at most {MAXIMUM} samples, got {plan.duration:g} s with a sampling time of {dt:g} s"
             )
         self.last = math.ceil(plan.duration / dt - _EARLY) + self._factor.size - 1
 

@@ -89,9 +89,14 @@ class Dynamics:
             inputs = self.inputs(segment, starts, _TERMS - 1)
             terms = inputs * (length ** np.arange(_TERMS) / FACTORIALS[:_TERMS])[:, None, None]
             sizes = np.abs(terms).max(axis=(1, 2))
-            if sizes[-4:].max() <= 1e-17 * sizes.max() or 2 * count > _MOST:
+            if sizes[-4:].max() <= 1e-17 * sizes.max():
                 break
             count *= 2
+            if count > _MOST:
+                raise ValueError(
+                    f"derivatives of plan must stay within those of {_MOST} polynomials in a segment of {span:g} s, "
+                    "got faster ones"
+                )
         return Cells(length, terms, series(self.z, length, terms, np.zeros(terms.shape[1:])).sum(axis=0))
 
 

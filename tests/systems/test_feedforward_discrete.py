@@ -384,6 +384,23 @@ def test_other_sampled_loops_are_rejected(blocks, error, message):
         cp.create_feedforward_iosystem(loop, plan=move())
 
 
+def test_sampled_loops_have_as_many_inputs_as_outputs():
+    plant = ct.ss(ct.tf([1], [1, 1]), inputs="u", outputs="y", name="plant")
+    loop = ct.interconnect([controller(), plant], inputs="r", outputs=["y", "u"], name="loop")
+    with pytest.raises(ValueError, match=r"^loop must have as many inputs as outputs, got 1 and 2$"):
+        cp.create_feedforward_iosystem(loop, plan=move())
+
+
+def test_previews_of_too_many_samples():
+    slow = ct.ss(ct.tf([-1, 1 + 1e-7], [1, -0.5], 0.01), inputs="r", outputs="y", name="loop")
+    with pytest.raises(
+        ValueError, match=r"^zeros of loop outside of the unit circle must require at most 5000000 samp"
+    ):
+        cp.create_feedforward_iosystem(slow, plan=move())
+    with pytest.raises(ValueError, match=r"^preview must be at most 5000000 samples of 0.01 s, got 1e\+09 s$"):
+        cp.create_feedforward_iosystem(slow, plan=move(), preview=1e9)
+
+
 def test_sampled_loops_require_a_plan():
     with pytest.raises(
         ValueError, match=r"^loop loop with sampled blocks requires plan=: the command depends on later"
