@@ -82,8 +82,7 @@ def discrete_motion(
     """The same for a discrete loop, whose time is the number of samples."""
     rows = loop.C / _ranges(plan)[:, None]
     found, state, change, stride, time = [rows @ shape], shape, np.asarray(loop.A), 1, 0
-    decays = -np.log(np.clip(np.abs(eigenvalues(loop.A)), 1e-300, 1.0))
-    end = 2 * loop.nstates + _DECAYED / decays[decays > 1e-9].min(initial=np.inf) if stable else 0.0
+    end = 2 * loop.nstates + _longest(np.log(eigenvalues(loop.A) + 1e-15)) if stable else 0.0
     while time < end:
         for _ in range(min(_MOST, math.ceil((end - time) / stride))):
             state, time = change @ state, time + stride
@@ -124,14 +123,22 @@ def _octaves(poles: ComplexArray) -> list[tuple[float, float, int]]:
     damped = decays > 1e-9 * sizes.max(initial=0.0)
     if not sizes.any():
         return [(0.0, 0.0, 1)]
-    end = max(_DECAYED / decays[damped].min(initial=np.inf), 4.0 * np.pi / sizes[sizes > 0.0].min())
-    found, time, length = [], 0.0, 1.0 / sizes.max()
+    end, time, length = _longest(poles), 0.0, 1.0 / sizes.max()
+    found = []
     while time < end:
         alive = sizes[~damped | (decays * time < _DECAYED)].max(initial=0.0)
         count = int(min(max(np.ceil(length * alive / _STEP), 16), _MOST))
         found.append((time, length / count, count))
         time, length = time + length, time + length
     return found
+
+
+def _longest(poles: ComplexArray) -> float:
+    """Time after which damped modes have decayed and others have had two periods."""
+    sizes, decays = np.abs(poles), -poles.real
+    limit = 1e-9 * sizes.max(initial=0.0)
+    slowest, smallest = decays[decays > limit].min(initial=np.inf), sizes[sizes > limit].min(initial=np.inf)
+    return float(max(_DECAYED / slowest, 4.0 * np.pi / smallest))
 
 
 def _shortest(motion: FreeMotion, error: float) -> float:

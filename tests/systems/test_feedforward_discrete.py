@@ -71,6 +71,13 @@ def test_zeros_outside_of_the_circle_need_a_preview(num, den, dt):
     assert shorter.preview == pytest.approx(block.preview - dt)
 
 
+@pytest.mark.parametrize("poles", [[1.0, 0.5], np.exp([0.1j, -0.1j]), [np.exp(-1e-3), 0.3], [0.0, 0.0]])
+def test_the_error_of_a_preview_for_poles_that_decay_slowly_or_not(poles):
+    loop = ct.ss(ct.tf([-1, 1.15], np.poly(poles).real, 0.1), inputs="r", outputs="y", name="loop")
+    block, _, _, error = followed(loop, move(), 70.0, 0.1)
+    assert error.max() == pytest.approx(block.error, rel=1e-3)
+
+
 def test_the_command_is_the_bounded_solution():
     """For y[k + 1] - 0.5 y[k] = w[k] = 2 r[k] - r[k + 1]: r[k] is the sum of 2^-(i + 1) w[k + i]."""
     dt, plan = 0.1, move()

@@ -126,6 +126,7 @@ def test_a_plan_from_another_position_starts_at_rest_there():
             ([1, 1], [-1, -2, -3]),
             ([1], [-1, 0, -2]),
             ([2, -3, 5], [-1, -2 + 9j, -2 - 9j]),
+            ([1], [1j, -1j, -1]),
         ],
     ),
 )
