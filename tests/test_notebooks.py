@@ -105,6 +105,36 @@ def test_the_first_is_seven_cells():
     assert len(code_cells(nbformat.read(NOTEBOOKS[0], as_version=4))) == 7
 
 
+# How long a program of a newcomer is
+
+
+def lines(cells):
+    """Number of lines of code in cells, without blank ones."""
+    return sum(bool(line.strip()) for cell in cells for line in cell.source.splitlines())
+
+
+def program(name, heading):
+    """Cells of a notebook from its imports and a heading to the report."""
+    cells = nbformat.read(FOLDER / name, as_version=4).cells
+    imports = next(cell for cell in cells if cell.cell_type == "code")
+    first = next(k for k, cell in enumerate(cells) if cell.source.startswith(heading))
+    last = next(k for k, cell in enumerate(cells) if k > first and ".report(" in cell.source)
+    return [imports, *(cell for cell in cells[first : last + 1] if cell.cell_type == "code")]
+
+
+@pytest.mark.parametrize(
+    ("name", "heading", "most"),
+    [
+        ("07_your_own_plant.ipynb", "## The equations", 39),
+        ("08_cars_and_quadrotors.ipynb", "## A lane change", 15),
+        ("08_cars_and_quadrotors.ipynb", "## A planar quadrotor", 20),
+    ],
+)
+def test_programs_from_equations_to_report_are_short(name, heading, most):
+    """Imports included; that they run is tested below."""
+    assert lines(program(name, heading)) <= most
+
+
 # That it runs
 
 
@@ -163,4 +193,4 @@ def test_html_is_compared_by_its_words():
 
 def test_the_folder_is_that_of_the_repository():
     assert Path(__file__).parents[1] / "notebooks" == FOLDER
-    assert len(NOTEBOOKS) == 7
+    assert len(NOTEBOOKS) == 9
