@@ -143,9 +143,9 @@ class QuantitiesOnPath:
         return {name: found[name] for name in (self._names if len(jet) > 1 else self._at_any_pace)}
 
     def rates(self, jet: Array) -> dict[str, Array]:
-        """Time derivatives of states and inputs, from a jet of order 2 at least."""
+        """Time derivatives of states and inputs; of those that depend on the pace from a jet of order 2 at least."""
         values, slopes = self._table.at(jet[0, -1])
-        pace, change = jet[1:3, -1]
+        pace, change = jet[1, -1], jet[2, -1] if len(jet) > 2 else np.nan
         u, slope = values[self._nstates :], slopes[self._nstates :]
         inputs = np.where(self._degrees, slope * pace**2 + u * change, slope * pace)
         return dict(zip(self._names, [*slopes[: self._nstates] * pace, *inputs], strict=True))

@@ -333,17 +333,17 @@ def fastest_under(
 
 def _fastest_between_stops(plan: PathPlan, limited: Limited, span: tuple[float, float] | None) -> Fastest:
     """Plan with a time law of minimum duration for each segment; the stops make them independent."""
-    laws: list[Trajectory] = []
-    for curve, direction, law in zip(plan.segments, plan.directions, plan.laws, strict=True):
-        part = PathPlan([curve], [direction], law.shift(-law.start), labels=plan.labels)
+    uniform = fastest_within(plan, limited, span)
+    laws = []
+    scaled = plan.retime(uniform.duration)
+    for curve, direction, law in zip(plan.segments, plan.directions, scaled.laws, strict=True):
+        # The values of the time law are times: relative to the start they have full precision.
+        begun = law.shift(-law.start)
+        part = PathPlan([curve], [direction], begun, labels=plan.labels)
         own = limited.of(part)
-        uniform = fastest_within(part, own)
-        scaled = part.laws[0].retime(uniform.duration)
-        fast = Retimed(scaled, with_fast_time_law(own.seen(part.with_laws([scaled])), own).law)
-        retimed = fastest_within(part.with_laws([fast]), own)
-        law, best = (fast, retimed) if retimed.duration < uniform.duration else (scaled, uniform)
-        laws.append(law.retime(best.duration))
-    found = fastest_within(plan.with_laws(laws), limited, span)
+        laws.append(Retimed(begun, with_fast_time_law(own.seen(part), own).law))
+    retimed = fastest_within(plan.with_laws(laws), limited, span)
+    found = min(retimed, uniform, key=lambda found: found.duration)
     return replace(found, hold="path")
 
 

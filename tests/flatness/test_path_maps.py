@@ -3,7 +3,7 @@
 import control.flatsys as fs
 import numpy as np
 import pytest
-from parking import BACKWARD, FORWARD, WHEELBASE, curve, expected, law, parking
+from parking import BACKWARD, FORWARD, by_hand, curve, expected, law, parking
 
 pytest.importorskip("casadi")
 
@@ -16,40 +16,6 @@ PLAN = parking()
 T = np.concatenate([np.linspace(-1.0, 12.0, 53), PLAN.stops])
 CAR, RATE = (cp.flat_system(plant, ["x", "y"], at={"v": 1.0}) for plant in (car, car_rate))
 LINE = cp.PolySpline([cp.Waypoint(0, [0, 0], 0, 0), cp.Waypoint(4, [4, 3], 0, 0)], labels=["x", "y"])
-
-
-def by_hand(steering="two arguments", **options):
-    """The car of the literature, rear axle as flat output."""
-
-    def reverse(flag, params=None):
-        (x, vx, ax), (y, vy, ay) = flag
-        across = vx * ay - vy * ax
-        with np.errstate(divide="ignore", invalid="ignore"):
-            if steering == "two arguments":
-                delta = np.arctan2(WHEELBASE * across, np.hypot(vx, vy) ** 3)
-            else:
-                delta = np.arctan(WHEELBASE * across / np.hypot(vx, vy) ** 3)
-        return np.stack([x, y, np.arctan2(vy, vx)]), np.stack([np.hypot(vx, vy), delta])
-
-    def forward(x, u, params=None):
-        c, s, turn = np.cos(x[2]), np.sin(x[2]), u[0] * np.tan(u[1]) / WHEELBASE
-        return [np.array([x[0], u[0] * c, -u[0] * turn * s]), np.array([x[1], u[0] * s, u[0] * turn * c])]
-
-    return cp.FlatSystem(
-        forward,
-        reverse,
-        car.updfcn,
-        lambda t, x, u, params: x,
-        **{
-            "orders": (2, 2),
-            "flat_labels": ("x", "y"),
-            "states": car.state_labels,
-            "inputs": car.input_labels,
-            "outputs": car.state_labels,
-            "name": "by_hand",
-            **options,
-        },
-    )
 
 
 @pytest.mark.parametrize("flat", [CAR, RATE, by_hand(), by_hand("quotient")], ids=["car", "rate", "atan2", "quotient"])

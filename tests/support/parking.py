@@ -33,12 +33,13 @@ def expected(plan, t):
 
     With z = dp/ds as a complex number, curvature by parameter is Im(z' conj z) / |z|^3.
     """
-    theta, speed, delta, rate = np.empty((4, len(t)))
-    for k, time in enumerate(t):
-        i = max(0, min(int(np.searchsorted(plan.stops, time, side="right")) - 1, len(plan.segments) - 1))
-        direction = plan.directions[i]
-        s, ds = plan.laws[i].jet(time, 1)[:, 0]
-        x, y = plan.segments[i].jet(s, 3).transpose(1, 0)
+    t = np.asarray(t)
+    theta, speed, delta, rate = np.empty((4, t.size))
+    number = np.clip(np.searchsorted(plan.stops, t, side="right") - 1, 0, len(plan.segments) - 1)
+    for i, (curve, law, direction) in enumerate(zip(plan.segments, plan.laws, plan.directions, strict=True)):
+        k = np.flatnonzero(number == i)
+        s, ds = law.jet(t[k], 1)[:, 0]
+        x, y = curve.jet(s, 3).transpose(1, 0, 2)
         z, dz, ddz = x[1:] + 1j * y[1:]
         theta[k] = np.angle(direction * z)
         speed[k] = direction * ds * abs(z)
@@ -48,3 +49,40 @@ def expected(plan, t):
         growth -= 3.0 * (dz * z.conjugate()).imag * (dz * z.conjugate()).real / abs(z) ** 5
         rate[k] = WHEELBASE * direction * growth * ds / (1.0 + (WHEELBASE * curvature) ** 2)
     return theta, speed, delta, rate
+
+
+def by_hand(steering="two arguments", **options):
+    """The car of the literature, rear axle as flat output."""
+
+    def reverse(flag, params=None):
+        (x, vx, ax), (y, vy, ay) = flag
+        across = vx * ay - vy * ax
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if steering == "two arguments":
+                delta = np.arctan2(WHEELBASE * across, np.hypot(vx, vy) ** 3)
+            else:
+                delta = np.arctan(WHEELBASE * across / np.hypot(vx, vy) ** 3)
+        return np.stack([x, y, np.arctan2(vy, vx)]), np.stack([np.hypot(vx, vy), delta])
+
+    def forward(x, u, params=None):
+        c, s, turn = np.cos(x[2]), np.sin(x[2]), u[0] * np.tan(u[1]) / WHEELBASE
+        return [np.array([x[0], u[0] * c, -u[0] * turn * s]), np.array([x[1], u[0] * s, u[0] * turn * c])]
+
+    def rates(t, x, u, params=None):
+        return np.array([u[0] * np.cos(x[2]), u[0] * np.sin(x[2]), u[0] * np.tan(u[1]) / WHEELBASE])
+
+    return cp.FlatSystem(
+        forward,
+        reverse,
+        rates,
+        lambda t, x, u, params: x,
+        **{
+            "orders": (2, 2),
+            "flat_labels": ("x", "y"),
+            "states": ["x", "y", "th"],
+            "inputs": ["v", "delta"],
+            "outputs": ["x", "y", "th"],
+            "name": "by_hand",
+            **options,
+        },
+    )
