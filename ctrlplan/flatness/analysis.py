@@ -30,8 +30,9 @@ class Analysis:
         Functions of (x, u, p) that are positive on the branch.
     notes : tuple of str
         Operation of each side.
-    replaced : tuple of str
-        Inputs that were replaced by a function of them.
+    entering : casadi.SX
+        Functions of the controls by which they enter, which are the controls of the
+        structure: of each control itself or, such as tan or a square, of a function.
     structure : Structure
         Orders, extension, derivatives of the flat outputs.
     scales : ndarray
@@ -44,7 +45,7 @@ class Analysis:
     point: OperatingPoint
     sides: ca.SX
     notes: tuple[str, ...]
-    replaced: tuple[str, ...]
+    entering: ca.SX
     structure: Structure
     scales: Array
     rate: float
@@ -81,27 +82,25 @@ def analysed(
     rates, outputs, flat = branch.expressions
     smooth = replace(equations, rates=rates, outputs=outputs, flat=flat)
     sizes, rate = scales_at(smooth, ca.vertcat(rates, flat), np.concatenate([point.x, point.u]), scales)
-    plant, replaced = _with_functions(smooth, point, sizes, rate)
-    found = Analysis(smooth, point, branch.sides, branch.notes, replaced, structure_of(plant), sizes, rate)
+    plant, entering = _with_functions(smooth, point, sizes, rate)
+    found = Analysis(smooth, point, branch.sides, branch.notes, entering, structure_of(plant), sizes, rate)
     return found, equations
 
 
-def _with_functions(
-    equations: Equations, point: OperatingPoint, sizes: Array, rate: float
-) -> tuple[Plant, tuple[str, ...]]:
-    """Plant with each input that enters through one function of it replaced by that function."""
+def _with_functions(equations: Equations, point: OperatingPoint, sizes: Array, rate: float) -> tuple[Plant, ca.SX]:
+    """Plant with each input that enters through one function of it replaced by that function, and the functions."""
     rates, flat = equations.rates, equations.flat
     mu, controls = (list(ca.vertsplit(equations.u)) for _ in range(2))
-    replaced: list[str] = []
+    entering = list(ca.vertsplit(equations.u))
     n = len(equations.states)
     centre, sizes = np.concatenate([point.x, point.u]), sizes.copy()
-    for k, name in enumerate(equations.inputs):
+    for k in range(len(equations.inputs)):
         others = ca.vertcat(ca.SX(0, 1), *(mu[i] for i in range(len(mu)) if i != k))
         found = replaced_input((rates, flat), (equations.x, others, equations.p), mu[k], float(point.u[k]))
         if found is not None:
             (rates, flat), replacement = found
             _replace(replacement, k, n, mu, controls, centre, sizes)
-            replaced.append(name)
+            entering[k] = replacement.value
     plant = Plant(
         name=equations.name,
         z=equations.x,
@@ -117,7 +116,7 @@ def _with_functions(
         values=equations.values,
         equilibrium=point.equilibrium,
     )
-    return plant, tuple(replaced)
+    return plant, ca.vertcat(*entering)
 
 
 def _replace(

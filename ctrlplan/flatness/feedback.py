@@ -11,12 +11,16 @@ import numpy as np
 
 from ctrlplan._types import Array
 from ctrlplan.flatness.analysis import Analysis
-from ctrlplan.flatness.structure import Round
+from ctrlplan.flatness.limited import limited_controls
+from ctrlplan.flatness.structure import Round, nearby, steadiness
 from ctrlplan.symbolic.tape import Tape
 from ctrlplan.symbolic.taping import tape_of
 
 _REGULAR = 0.1
 """Variation of a matrix near the operating point below which a law without states is rejected."""
+
+_QUICK = 10.0
+"""Rate at which limits are approached, relative to the fastest pole."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +72,17 @@ def pole_counts(analysis: Analysis, quasi_static: bool, name: str) -> tuple[int,
     return _closed(analysis, name)[0]
 
 
-def law_with_states(analysis: Analysis, gains: Sequence[Sequence[float]], integral: bool) -> LawExpressions:
+def law_with_states(
+    analysis: Analysis,
+    gains: Sequence[Sequence[float]],
+    integral: bool,
+    limits: tuple[Array, Array] | None = None,
+) -> LawExpressions:
     """Law whose states are those of the extension.
+
+    With limits the states of the extension and the integrals are those of the
+    controls that are applied: the integrals tend to the values at which the error
+    equations demand what the limits permit, with the largest time constant of each.
 
     Parameters
     ----------
@@ -79,6 +92,8 @@ def law_with_states(analysis: Analysis, gains: Sequence[Sequence[float]], integr
         Coefficients of the error polynomial of each flat output, lowest order first.
     integral : bool
         Whether each polynomial has one more coefficient, of the integral of the error.
+    limits : tuple of ndarray, shape (ncontrols,), optional
+        Lower and upper limits of the controls.
     """
     structure = analysis.structure
     reference = _Reference(analysis, structure.extension, integral)
@@ -87,10 +102,20 @@ def law_with_states(analysis: Analysis, gains: Sequence[Sequence[float]], integr
     for j, flag in enumerate(structure.flags):
         measured = ca.substitute(flag, structure.z, z)
         wanted.append(_closing(reference, j, measured, list(gains[j]), integral))
-    mu = _controls(analysis, z, ca.vertcat(*wanted))
+    last = ca.vertcat(*wanted)
+    mu = _controls(analysis, z, last)
+    errors = _errors(analysis, reference)
+    if limits is not None:
+        roots = [np.abs(np.roots([1.0, *row[::-1]])) for row in gains]
+        mu = limited_controls(analysis, z, mu, limits, _QUICK * max(float(row.max()) for row in roots))
+        if integral:
+            missing = last - _at(structure.last, analysis, z, mu)
+            errors += ca.vertcat(*(row.min() / gain[0] for row, gain in zip(roots, gains, strict=True))) * missing
     u = _at(structure.controls, analysis, z, mu)
+    if limits is not None:
+        u = ca.fmin(ca.fmax(u, ca.DM(limits[0])), ca.DM(limits[1]))
     rates = _at(structure.rates, analysis, z, mu)[structure.nstates :]
-    return _tapes(analysis, reference, u, rates, structure.orders, structure.extension)
+    return _tapes(analysis, reference, u, ca.vertcat(rates, errors), structure.orders, structure.extension)
 
 
 def law_without_states(
@@ -127,23 +152,22 @@ def law_without_states(
     v = ca.vertcat(*(derivative(j, r) for j, r in enumerate(structure.orders)))
     mu = _controls(analysis, known, v)
     u = _at(structure.controls, analysis, known, mu)
-    return _tapes(analysis, reference, u, ca.SX(0, 1), counts, 0)
+    return _tapes(analysis, reference, u, _errors(analysis, reference), counts, 0)
+
+
+def _errors(analysis: Analysis, reference: _Reference) -> ca.SX:
+    """Rates of the integrals: the errors of the flat outputs."""
+    if not reference.integrals.numel():
+        return ca.SX(0, 1)
+    return analysis.equations.flat - ca.vertcat(*(row[0] for row in reference.rows))
 
 
 def _tapes(
-    analysis: Analysis,
-    reference: _Reference,
-    u: ca.SX,
-    rates: ca.SX,
-    counts: tuple[int, ...],
-    extension: int,
+    analysis: Analysis, reference: _Reference, u: ca.SX, rates: ca.SX, counts: tuple[int, ...], extension: int
 ) -> LawExpressions:
     equations = analysis.equations
     arguments = (reference.column, equations.x, reference.own, equations.p)
-    errors = ca.SX(0, 1)
-    if reference.integrals.numel():
-        errors = equations.flat - ca.vertcat(*(row[0] for row in reference.rows))
-    return LawExpressions(tape_of(arguments, u), tape_of(arguments, ca.vertcat(rates, errors)), counts, extension)
+    return LawExpressions(tape_of(arguments, u), tape_of(arguments, rates), counts, extension)
 
 
 def _closing(reference: _Reference, j: int, measured: ca.SX, gains: list[float], integral: bool) -> ca.SX:
@@ -219,27 +243,17 @@ def _regular_rows(analysis: Analysis, entry: Round, closed: dict[int, int], name
     tape = tape_of((structure.z, structure.p), entry.matrix)
     nz = structure.z.numel()
     centre, scales = structure.point[:nz], structure.scales[:nz]
-    rng = np.random.default_rng(2)
     best: list[tuple[float, list[int]]] = []
     for region in (0.5, 0.15, 0.05, 0.005):
-        shifts = [region * scales * rng.uniform(-1.0, 1.0, nz) for _ in range(8)]
-        points = np.column_stack([centre, *(centre + shift for shift in shifts)])
+        points = np.column_stack(list(nearby(centre, scales, region)))
         values = tape(points, analysis.equations.values[:, None]).reshape(len(entry.rows), rank, -1)
         best = []
         for extra in combinations(free, rank - len(fixed)):
             rows = sorted([*fixed, *extra])
-            best.append((_steadiness(values[rows]), rows))
+            best.append((steadiness(values[rows]), rows))
         if max(best)[0] > _REGULAR:
             return max(best)[1]
     raise ValueError(
         f"quasi_static must be False for {name}: the states of its extension are not determined by the errors near the "
         "operating point"
     )
-
-
-def _steadiness(values: Array) -> float:
-    """Smallest over largest determinant of matrices (rank, rank, n); 0 where it changes sign."""
-    found = np.linalg.det(np.moveaxis(values, -1, 0))
-    if not np.isfinite(found).all() or (np.sign(found) != np.sign(found[0])).any() or not found.all():
-        return 0.0
-    return float(np.abs(found).min() / np.abs(found).max())

@@ -56,6 +56,28 @@ class Round:
 
 
 @dataclass(frozen=True, eq=False)
+class Extension:
+    """Controls that became states of the extension: mu_p = w - N mu_o.
+
+    Attributes
+    ----------
+    controls : casadi.SX
+        mu before the extension.
+    pivots : tuple of int
+        Places of mu_p in mu, which afterwards are those of w'.
+    mixed : casadi.SX
+        N mu_o as a function of states and the other controls.
+    states : casadi.SX
+        w.
+    """
+
+    controls: ca.SX
+    pivots: tuple[int, ...]
+    mixed: ca.SX
+    states: ca.SX
+
+
+@dataclass(frozen=True, eq=False)
 class Structure:
     """Extended plant z' = F(z, mu) and the derivatives of its flat outputs.
 
@@ -73,7 +95,9 @@ class Structure:
     controls : casadi.SX
         Controls of the plant as functions of z and mu.
     rounds : tuple of Round
-        The extensions.
+        The extensions by combinations of controls.
+    extensions : tuple of Extension
+        All extensions, in their order.
     prolonged : bool
         Whether a control became a state by itself.
     nstates : int
@@ -90,6 +114,7 @@ class Structure:
     last: ca.SX
     controls: ca.SX
     rounds: tuple[Round, ...]
+    extensions: tuple[Extension, ...]
     prolonged: bool
     nstates: int
     point: Array
@@ -168,6 +193,7 @@ class _Algorithm:
     rates: ca.SX = field(init=False)
     controls: ca.SX = field(init=False)
     rounds: list[Round] = field(default_factory=list)
+    extensions: list[Extension] = field(default_factory=list)
     prolonged: bool = False
 
     def __post_init__(self) -> None:
@@ -270,6 +296,7 @@ class _Algorithm:
         for k in chosen:
             count = len(self.z) - self.n
             old, new = self.mu[k], ca.SX.sym(f"w{count + 1}_d1")
+            self.extensions.append(Extension(self.inputs, (k,), ca.SX.zeros(1), old))
             at = len(self.z) + k
             self.z.append(old)
             self.rates = ca.vertcat(self.rates, new)
@@ -305,6 +332,7 @@ class _Algorithm:
         old, kept = ca.vertcat(*(self.mu[k] for k in pivots)), ca.vertcat(ca.SX(0, 1), *(self.mu[k] for k in others))
         mixed = combined @ kept if others else ca.SX.zeros(rank)
         combination, inverse = old + mixed, w - mixed
+        self.extensions.append(Extension(self.inputs, tuple(pivots), mixed, w))
         self.rounds.append(Round(tuple(rows), tuple(len(flag) for flag in self.flags), combination, first, idle, w))
         exact = tape_of((self.column, self.inputs, self.plant.p), combination)(
             self.centre[:nz], self.centre[nz:], self.plant.values
@@ -345,19 +373,13 @@ class _Algorithm:
         sizes = np.abs(influence.numbers() * self.scale[nz:]).max(axis=1)
         best: list[float] = []
         for region in (0.5, 0.15, 0.05, 0.005):
-            points = np.column_stack([self.centre, *self._near(region)])
+            points = np.column_stack(list(nearby(self.centre, self.scale, region)))
             values = tape(points[:nz], points[nz:], self.plant.values[:, None]) / sizes[:, None, None]
             values = values.reshape(len(rows), len(self.mu), -1)
             best = [_variation(values[:, chosen]) for chosen in candidates]
             if max(best) > _LEAST_VARIATION:
                 break
         return candidates[int(np.argmax(best))]
-
-    def _near(self, region: float) -> Iterator[Array]:
-        """Eight points at random within a number of scales."""
-        rng = np.random.default_rng(1)
-        for _ in range(8):
-            yield self.centre + region * self.scale * rng.uniform(-1.0, 1.0, self.centre.size)
 
     def _random_point(self) -> Point:
         """Point near the operating point where the equations are finite."""
@@ -396,6 +418,7 @@ class _Algorithm:
             last=last,
             controls=self.controls,
             rounds=tuple(self.rounds),
+            extensions=tuple(self.extensions),
             prolonged=self.prolonged,
             nstates=self.n,
             point=self.centre,
@@ -425,6 +448,22 @@ class _Algorithm:
         if self.plant.mu.numel() == 1 and not _has_flat_output(self.plant):
             return "; no output of this plant is flat"
         return ""
+
+
+def nearby(centre: Array, scales: Array, region: float) -> Iterator[Array]:
+    """A point, and eight points at random within a number of scales of it."""
+    rng = np.random.default_rng(1)
+    yield centre
+    for _ in range(8):
+        yield centre + region * scales * rng.uniform(-1.0, 1.0, centre.size)
+
+
+def steadiness(values: Array) -> float:
+    """Smallest over largest determinant of matrices (rank, rank, n); 0 where it changes sign."""
+    found = np.linalg.det(np.moveaxis(values, -1, 0))
+    if not np.isfinite(found).all() or (np.sign(found) != np.sign(found[0])).any() or not found.all():
+        return 0.0
+    return float(np.abs(found).min() / np.abs(found).max())
 
 
 def zeros_at(plant: Plant) -> NDArray[np.complex128] | None:

@@ -213,7 +213,9 @@ _PYTHON: Operations = {
     "SQ": lambda x: x * x,
     "TWICE": lambda x: x + x,
     "INV": lambda x: 1.0 / x,
+    "FMIN": lambda x, y: y if y < x or x != x else x,
+    "FMAX": lambda x, y: y if y > x or x != x else x,
     **{name.upper(): getattr(math, name) for name in str.split("exp log sqrt sin cos tan asin acos atan atan2 hypot")},
     **{name.upper(): getattr(math, name) for name in str.split("sinh cosh tanh asinh acosh atanh log1p expm1 fabs")},
 }
-"""Smooth operations on Python's numbers, which raise outside of their domain."""
+"""Operations on Python's numbers, which raise outside of their domain."""

@@ -40,22 +40,17 @@ def create_derived_law(
     counts = pole_counts(analysis, quasi_static, str(flat.name))
     gains = checked_gains(poles, [count + int(integral) for count in counts])
     bounds = input_bounds(limits, flat)
-    if bounds is not None and not quasi_static and flat.extension:
-        raise ValueError(
-            f"limits must be None for a law with the states of an extension, as that of {flat.name} has: these states "
-            "would not follow saturated inputs; use quasi_static=True"
-        )
     if quasi_static:
         law = law_without_states(analysis, gains, integral, str(flat.name))
     else:
-        law = law_with_states(analysis, gains, integral)
+        law = law_with_states(analysis, gains, integral, bounds)
     first = _initial(flat, start, law.extension)
     return _block(
         flat,
         law.control,
         law.rates,
         np.concatenate([first, np.zeros(len(labels) * integral)]),
-        bounds,
+        bounds if quasi_static else None,
         labels,
         suffix,
         integral,

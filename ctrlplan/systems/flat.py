@@ -28,7 +28,7 @@ from ctrlplan.flatness.verify import (
     random_probes,
     warn_of_output,
 )
-from ctrlplan.systems.derived_laws import create_derived_law, references
+from ctrlplan.systems.derived_laws import InputLimits, create_derived_law, references
 from ctrlplan.systems.poles import checked_gains
 
 
@@ -40,6 +40,7 @@ def create_flat_iosystem(
     quasi_static: bool = False,
     integral: bool = False,
     start: ArrayLike | None = None,
+    limits: InputLimits | None = None,
     labels: Sequence[str] | str | None = None,
     suffix: str = "_ref",
     name: str = "flat_law",
@@ -91,6 +92,12 @@ def create_flat_iosystem(
         disturbance leaves no constant error. Default False.
     start : array_like, shape (extension,), optional
         Initial states of the extension. Default: those at the operating point.
+    limits : mapping of str to pair of float, optional
+        Lower and upper limits of inputs of the plant by name, within which the
+        outputs stay. States of the extension, and integrals of a law without
+        `quasi_static`, are those of the limited inputs; where a limit of an input in
+        place of which there is such a state is active, the other flat outputs still
+        satisfy their error equations. Default: none.
     labels : sequence of str or str, optional
         Names of the flat outputs. Default: those that `flat` has or, for a flat
         system of python-control, the names of its outputs if these are the flat
@@ -157,7 +164,7 @@ def create_flat_iosystem(
     >>> bool(abs(found.outputs - plan(found.time)).max() < 1e-7)
     True
     """
-    derived = derived_system_of(flat, quasi_static or integral)
+    derived = derived_system_of(flat, quasi_static or integral or limits is not None)
     if derived is not None:
         names = derived.flat_labels if labels is None else checked_labels(labels, len(derived.flat_labels))
         return create_derived_law(
@@ -169,6 +176,7 @@ def create_flat_iosystem(
             labels=names,
             suffix=suffix,
             name=name,
+            limits=limits,
         )
     if start is not None:
         raise ValueError(f"start must be None for {flat.name}, whose law has no states of an extension")

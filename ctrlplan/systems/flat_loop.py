@@ -230,8 +230,8 @@ def flat_loop(
     law : FlatLaw, Feedforward or TVLQR, optional
         The law. One of `poles` and `law` is required.
     limits : mapping of str to pair of float, optional
-        Limits of inputs of the plant by name: they are saturated. Not for a
-        `FlatLaw` with the states of an extension.
+        Limits of inputs of the plant by name: they are saturated. The states of a
+        `FlatLaw` follow what is applied; see `create_flat_iosystem`.
     initial_state : array_like, shape (nstates,), optional
         Initial state of the plant. Default: that of the plan at its start.
     disturbances : sequence of str or str, optional

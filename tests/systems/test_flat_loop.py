@@ -167,8 +167,6 @@ def test_bad_arguments_of_a_loop():
         cp.flat_loop(MOTOR, TURN, poles=[-1, -2, -3], initial_state=[0.0])
     with pytest.raises(ValueError, match="disturbances must be among"):
         cp.flat_loop(crane(), lift(), poles=[FAST, FAST], disturbances="rain")
-    with pytest.raises(ValueError, match="quasi_static=True"):
-        cp.flat_loop(crane(), lift(), poles=[FAST, FAST], limits={"F": 4000.0})
     with pytest.raises(ValueError, match="axes"):
         cp.flat_loop(MOTOR, cp.PolySpline(TURN.waypoints, labels="speed"), poles=[-1, -2, -3])
     with pytest.raises(ValueError, match="limits must"):
