@@ -69,12 +69,12 @@ def fastest_law(plan: Trajectory, bounds: Sequence[Bound], start: float) -> Fast
     grid = Grid.of(plan, [part for part in parts if part.moves])
     for refinement in range(_REFINEMENTS + 1):
         spline, activity = Spline.of(grid), Activity.of(grid, bounds, POINTS, start)
-        rows = activity.rows(grid.sizes)
+        rows = activity.rows(grid.length)
         problem = _problem(grid, spline, rows)
         x = swept(grid, spline, rows)
         x = minimum(problem, _START * problem.feasible_scale(x) * x)
         local = spline.coefficients(x)
-        loss = _losses(activity.worst(POINTS, local, grid.sizes), local, grid.sizes)
+        loss = _losses(activity.worst(POINTS, local, grid.length), local, grid.length)
         if loss.sum() < _LOSS or refinement == _REFINEMENTS:
             break
         grid = grid.divided(np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int))
@@ -83,8 +83,8 @@ def fastest_law(plan: Trajectory, bounds: Sequence[Bound], start: float) -> Fast
 
 def _problem(grid: Grid, spline: Spline, rows: Rows) -> Problem:
     """Duration by quadrature, and inequalities, for the coefficients of a spline."""
-    values = np.repeat(basis(_NODES)[0][:, None], grid.sizes.size, axis=1)
-    weights = _WEIGHTS[:, None] * grid.sizes
+    values = np.repeat(basis(_NODES)[0][:, None], grid.length.size, axis=1)
+    weights = _WEIGHTS[:, None] * grid.length
     # 1/sqrt(b) is integrated by the square root of the distance from a point at which b is 0.
     root = 2.0 * _NODES[:, None]
     first, last = grid.halts
@@ -105,7 +105,7 @@ def _law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array) -> T
     dwells = [span for part in parts if not part.moves for span in part.spans]
     own = [plan.breakpoints[span.segment] + span.start for span in dwells]
     places = np.append(plan.breakpoints[grid.segment] + grid.start, own)
-    rates = np.append(local * grid.units**2, np.ones((3, len(own))), axis=1)
+    rates = np.append(local, np.ones((3, len(own))), axis=1)
     order = np.argsort(places)
     return TimeLaw(np.append(places[order], plan.end), rates[:, order], plan.start)
 

@@ -54,8 +54,12 @@ class Part:
     ----------
     spans : tuple of Span
         The spans.
-    units : tuple of float
-        Unit of time of each span, with which the tangent of the path is continuous.
+    ratios : tuple of float
+        Speed of the plan at the end of each span relative to that at the start of the
+        next one.
+    bends : tuple of float
+        Acceleration of the plan along its velocity, relative to it [1/s]: increase
+        from the end of each span to the start of the next one, with its speed there.
     halts : (bool, bool)
         Whether the path has a corner at each end, at which it must be at rest.
     closed : bool
@@ -63,7 +67,8 @@ class Part:
     """
 
     spans: tuple[Span, ...]
-    units: tuple[float, ...]
+    ratios: tuple[float, ...]
+    bends: tuple[float, ...]
     halts: tuple[bool, bool]
     closed: bool = False
 
@@ -87,17 +92,21 @@ def parts_of(plan: Trajectory, stops: bool) -> list[Part]:
     ends = [0, *(k + 1 for k, joint in enumerate(joints) if joint.stops), len(spans)]
     parts = []
     for first, last in pairwise(ends):
-        ratios = [joints[k].ratio for k in range(first, last - 1)]
-        units = np.cumprod([1.0, *ratios]).tolist()
+        inner = [*joints[first : last - 1], _Joint(True, False)]
         halts = (first > 0 and joints[first - 1].corner, last < len(spans) and joints[last - 1].corner)
         halts = (halts[0] and not spans[first].rests[0], halts[1] and not spans[last - 1].rests[1])
-        parts.append(Part(tuple(spans[first:last]), tuple(units), halts))
-    if len(parts) == 1 and _is_closed(plan):
-        return [replace(parts[0], halts=(False, False), closed=True)]
-    if spans[0].moves and spans[-1].moves and _is_closed(plan):  # the last part leads into the first
-        begin, end = parts[0], parts.pop()
-        units = (*end.units, *(end.units[-1] * unit for unit in begin.units))
-        parts[0] = Part(end.spans + begin.spans, units, (end.halts[0], begin.halts[1]))
+        ratios, bends = tuple(joint.ratio for joint in inner), tuple(joint.bend for joint in inner)
+        parts.append(Part(tuple(spans[first:last]), ratios, bends, halts))
+    closing = _closing(plan) if spans[0].moves and spans[-1].moves else None
+    if closing is None:
+        return parts
+    begin, end = parts[0], parts[-1]
+    ratios, bends = (*end.ratios[:-1], closing.ratio), (*end.bends[:-1], closing.bend)
+    if len(parts) == 1:
+        return [replace(begin, ratios=ratios, bends=bends, halts=(False, False), closed=True)]
+    # The last part leads into the first.
+    halts = end.halts[0], begin.halts[1]
+    parts[0] = Part(parts.pop().spans + begin.spans, ratios + begin.ratios, bends + begin.bends, halts)
     return parts
 
 
@@ -113,11 +122,14 @@ class _Joint:
         Whether it must stop because the direction changes.
     ratio : float
         Speed before the point relative to that after it.
+    bend : float
+        Increase of the acceleration along the velocity, relative to it [1/s].
     """
 
     stops: bool
     corner: bool
-    ratio: float
+    ratio: float = 1.0
+    bend: float = 0.0
 
 
 def _joint(before: Array, after: Array, still: Array, stops: bool = True) -> _Joint:
@@ -126,13 +138,16 @@ def _joint(before: Array, after: Array, still: Array, stops: bool = True) -> _Jo
     if all(rests):
         # A reversal with acceleration is passed without a break.
         passes = (np.abs(after[2] - before[2]) <= 1e3 * still[1]).all() and (np.abs(after[2]) > 1e3 * still[1]).any()
-        return _Joint(not passes, False, 1.0)
+        return _Joint(not passes, False)
     moving = still[0] > 0.0
     tangents = [jet[1, moving] / still[0, moving] for jet in (before, after)]
     sizes = [float(np.linalg.norm(tangent)) for tangent in tangents]
     if any(rests) or (np.abs(tangents[0] / sizes[0] - tangents[1] / sizes[1]) > 1e-7).any():
-        return _Joint(stops, stops, 1.0)
-    return _Joint(False, False, sizes[0] / sizes[1] if abs(sizes[0] / sizes[1] - 1.0) > 1e-12 else 1.0)
+        return _Joint(stops, stops)
+    ratio = sizes[0] / sizes[1] if abs(sizes[0] / sizes[1] - 1.0) > 1e-12 else 1.0
+    jump = (ratio**2 * after[2, moving] - before[2, moving]) / still[0, moving]
+    bend = float(jump @ tangents[0]) / sizes[0] ** 2
+    return _Joint(False, False, ratio, bend)
 
 
 def _spans(plan: Trajectory, stops: bool) -> tuple[list[Span], list[_Joint]]:
@@ -160,7 +175,7 @@ def _spans(plan: Trajectory, stops: bool) -> tuple[list[Span], list[_Joint]]:
     joints = [
         _joint(jets[:, :, k, -1], jets[:, :, k + 1, 0], still, stops)
         if spans[k].moves and spans[k + 1].moves
-        else _Joint(True, stops, 1.0)
+        else _Joint(True, stops)
         for k in range(len(spans) - 1)
     ]
     return spans, joints
@@ -175,12 +190,12 @@ def _powers(velocities: Array) -> list[list[float]]:
     return np.where(rests & np.isfinite(powers), np.clip(powers, 1.0, None), 0.0).tolist()
 
 
-def _is_closed(plan: Trajectory) -> bool:
-    """Whether the end of a plan is continued by its start, in motion or with acceleration."""
+def _closing(plan: Trajectory) -> _Joint | None:
+    """Joint of the end of a closed plan with its start, if it is in motion or accelerated there; otherwise None."""
     first, last = plan.jet(plan.start, 2), plan.jet(plan.end, 2, left=True)
     extrema = plan.extrema()
     slack = 1e-9 * (extrema.maximum - extrema.minimum) + 1e-14 * np.abs(first[0])
     if (np.abs(last[0] - first[0]) > slack).any():
-        return False
+        return None
     joint = _joint(last, first, _STILL * np.stack([plan.peak(1), plan.peak(2)]))
-    return not joint.stops and abs(joint.ratio - 1.0) <= 1e-7
+    return None if joint.stops or abs(joint.ratio - 1.0) > 1e-7 else joint
