@@ -90,12 +90,11 @@ class Grid:
         bends[last] = [bend for part in self.parts for bend in part.bends]
         return ratios, bends
 
-    @cached_property
-    def halts(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Cells that begin, and those that end, at a corner at which the law stops."""
+    def ends(self, rate: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Cells that begin, and those that end, with a prescribed squared rate."""
         first = np.flatnonzero(np.diff(self.part, prepend=-1))
         last = np.append(first[1:], self.part.size) - 1
-        chosen = np.array([part.halts for part in self.parts])
+        chosen = np.array([[own == rate for own in part.rates] for part in self.parts])
         return first[chosen[:, 0]], last[chosen[:, 1]]
 
     def jets(self, fractions: Array) -> Array:
@@ -170,7 +169,7 @@ class Spline:
             cells, count, own = np.arange(end - begin), end - begin, slice(begin, end)
             # b and its slope along the path, 2 (x - b)/h on both sides, are continuous, with the speed of the plan.
             before, after = 1.0 / h[own], ratios[own] / np.roll(h[own], -1)
-            total = before + after - bends[own]
+            total = before + after - np.minimum(bends[own], 0.5 * (before + after))
             extraction[2, 1, own], extraction[2, 2, own] = before / total, after / ratios[own] ** 2 / total
             extraction[0, 0, own] = np.roll(extraction[2, 1, own] * ratios[own] ** 2, 1)
             extraction[0, 1, own] = np.roll(extraction[2, 2, own] * ratios[own] ** 2, 1)
@@ -183,7 +182,7 @@ class Spline:
             extraction[0, :2, begin] = 1.0, 0.0
             extraction[2, 1:, end - 1] = 0.0, 1.0
             size += count + 2
-            fixed += [part.halts[0], *[False] * count, part.halts[1]]
+            fixed += [part.rates[0] is not None, *[False] * count, part.rates[1] is not None]
         return cls(index, extraction, size, bandwidth, np.array(fixed))
 
     def coefficients(self, x: Array) -> Array:

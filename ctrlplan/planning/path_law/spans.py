@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -60,8 +61,9 @@ class Part:
     bends : tuple of float
         Acceleration of the plan along its velocity, relative to it [1/s]: increase
         from the end of each span to the start of the next one, with its speed there.
-    halts : (bool, bool)
-        Whether the path has a corner at each end, at which it must be at rest.
+    rates : (float or None, float or None)
+        Prescribed squared rates at both ends: 0 at a corner of the path, at which it
+        must be at rest; None for free ones.
     closed : bool
         Whether the end is continued by the start.
     """
@@ -69,7 +71,7 @@ class Part:
     spans: tuple[Span, ...]
     ratios: tuple[float, ...]
     bends: tuple[float, ...]
-    halts: tuple[bool, bool]
+    rates: tuple[float | None, float | None]
     closed: bool = False
 
     @property
@@ -78,7 +80,9 @@ class Part:
         return self.spans[0].moves
 
 
-def parts_of(plan: Trajectory, stops: bool) -> list[Part]:
+def parts_of(
+    plan: Trajectory, stops: bool, edges: Sequence[float] = (), fixed: tuple[bool, bool] = (False, False)
+) -> list[Part]:
     """Parts of a plan, dwells included.
 
     Parameters
@@ -87,26 +91,31 @@ def parts_of(plan: Trajectory, stops: bool) -> list[Part]:
         Plan with a duration and without jumps of the position.
     stops : bool
         Whether the plan stops at corners of the path.
+    edges : sequence of float, optional
+        Times [s] at which limits change.
+    fixed : (bool, bool), optional
+        Whether the plan keeps its velocities at both ends.
     """
-    spans, joints = _spans(plan, stops)
+    spans, joints = _spans(plan, stops, edges)
     ends = [0, *(k + 1 for k, joint in enumerate(joints) if joint.stops), len(spans)]
     parts = []
     for first, last in pairwise(ends):
         inner = [*joints[first : last - 1], _Joint(True, False)]
-        halts = (first > 0 and joints[first - 1].corner, last < len(spans) and joints[last - 1].corner)
-        halts = (halts[0] and not spans[first].rests[0], halts[1] and not spans[last - 1].rests[1])
+        start = (1.0 if fixed[0] else None) if first == 0 else 0.0 if joints[first - 1].corner else None
+        end = (1.0 if fixed[1] else None) if last == len(spans) else 0.0 if joints[last - 1].corner else None
+        rates = None if spans[first].rests[0] else start, None if spans[last - 1].rests[1] else end
         ratios, bends = tuple(joint.ratio for joint in inner), tuple(joint.bend for joint in inner)
-        parts.append(Part(tuple(spans[first:last]), ratios, bends, halts))
-    closing = _closing(plan) if spans[0].moves and spans[-1].moves else None
+        parts.append(Part(tuple(spans[first:last]), ratios, bends, rates))
+    closing = _closing(plan) if spans[0].moves and spans[-1].moves and not any(fixed) else None
     if closing is None:
         return parts
     begin, end = parts[0], parts[-1]
     ratios, bends = (*end.ratios[:-1], closing.ratio), (*end.bends[:-1], closing.bend)
     if len(parts) == 1:
-        return [replace(begin, ratios=ratios, bends=bends, halts=(False, False), closed=True)]
+        return [replace(begin, ratios=ratios, bends=bends, closed=True)]
     # The last part leads into the first.
-    halts = end.halts[0], begin.halts[1]
-    parts[0] = Part(parts.pop().spans + begin.spans, ratios + begin.ratios, bends + begin.bends, halts)
+    rates = end.rates[0], begin.rates[1]
+    parts[0] = Part(parts.pop().spans + begin.spans, ratios + begin.ratios, bends + begin.bends, rates)
     return parts
 
 
@@ -150,14 +159,15 @@ def _joint(before: Array, after: Array, still: Array, stops: bool = True) -> _Jo
     return _Joint(False, False, ratio, bend)
 
 
-def _spans(plan: Trajectory, stops: bool) -> tuple[list[Span], list[_Joint]]:
+def _spans(plan: Trajectory, stops: bool, edges: Sequence[float]) -> tuple[list[Span], list[_Joint]]:
     """Spans between breakpoints and waypoints, and the points between them."""
     segments, starts, ends = [], [], []
-    inner = np.array([waypoint.time for waypoint in plan.waypoints])
+    inner = np.unique([*(waypoint.time for waypoint in plan.waypoints), *edges])
     for segment, (left, right) in enumerate(pairwise(plan.breakpoints.tolist())):
         slack = 1e-9 * (right - left)
-        edges = [0.0, *(inner[(inner > left + slack) & (inner < right - slack)] - left).tolist(), right - left]
-        for first, last in pairwise(edges):
+        own = inner[(inner > left + slack) & (inner < right - slack)] - left
+        own = own[np.diff(own, prepend=0.0) > slack]
+        for first, last in pairwise([0.0, *own.tolist(), right - left]):
             segments.append(segment)
             starts.append(first)
             ends.append(last)

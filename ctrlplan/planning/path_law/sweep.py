@@ -30,7 +30,7 @@ def swept(grid: Grid, spline: Spline, rows: Rows) -> Array:
     cells, x = _Cells(rows, grid.joints[0] ** 2), np.empty(spline.size)
     firsts = np.flatnonzero(np.diff(grid.part, prepend=-1)).tolist()
     for part, begin, end in zip(grid.parts, firsts, [*firsts[1:], grid.part.size], strict=True):
-        starts = cells.closed(begin, end) if part.closed else cells.open(begin, end, part.halts)
+        starts = cells.closed(begin, end) if part.closed else cells.open(begin, end, part.rates)
         if not starts.max() < 1e-3 * _FAR:
             raise ValueError(
                 "limits must bound the speed along the whole path, got a part of it with limits of accelerations only "
@@ -61,14 +61,18 @@ class _Cells:
         self._of_end, self._of_start = _lines(start, end), _lines(end, start)
         self._best_end, self._largest_start = _peaks(*self._of_end)
 
-    def open(self, begin: int, end: int, halts: tuple[bool, bool]) -> Array:
-        """Rates at the starts of the cells of an open part, and at its end."""
+    def open(self, begin: int, end: int, rates: tuple[float | None, float | None]) -> Array:
+        """Rates at the starts of the cells of an open part, and at its end, some of which may be prescribed."""
         limit = np.empty(end - begin + 1)
-        limit[-1] = 0.0 if halts[1] else self._largest_end(end - 1)
+        limit[-1] = self._largest_end(end - 1) if rates[1] is None else rates[1]
         self._backward(limit, begin)
-        if halts[0]:
-            limit[0] = 0.0
-        return self._forward(limit, begin)
+        if rates[0] is not None:
+            _check_speed("start", rates[0], limit[0])
+            limit[0] = rates[0]
+        nodes = self._forward(limit, begin)
+        if rates[1] is not None:
+            _check_speed("end", rates[1], nodes[-1])
+        return nodes
 
     def closed(self, begin: int, end: int) -> Array:
         """The same for a closed part."""
@@ -102,6 +106,15 @@ class _Cells:
             cell = begin + k
             nodes[k + 1] = min(limit[k + 1], self.gains[cell] * (offset[cell] + slope[cell] * nodes[k]).min())
         return nodes
+
+
+def _check_speed(where: str, rate: float, largest: float) -> None:
+    if rate > largest * (1.0 + 1e-9):
+        reason = "slow down for the path that follows" if where == "start" else "be reached"
+        raise ValueError(
+            f"the speed at the {where} must {reason} within the limits, got that of the plan where at most "
+            f"{largest**0.5:.6g} of it may be"
+        )
 
 
 def _lines(one: Array, other: Array) -> tuple[Array, Array]:
