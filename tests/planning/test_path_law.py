@@ -208,6 +208,18 @@ def test_a_change_of_the_plans_speed_on_a_straight_line_is_no_corner():
     assert {jump.time for jump in found.plan.jumps(1)} <= {found.plan.start, found.plan.end}
 
 
+@pytest.mark.parametrize("count", [3, pytest.param(10, marks=pytest.mark.slow)])
+def test_the_speed_of_the_plan_on_its_path_does_not_matter(count):
+    """A straight line through uneven waypoints with any velocities, where accelerations of the plan jump."""
+    rng = np.random.default_rng(count)
+    places = np.concatenate([[0.0], np.sort(rng.uniform(0, 1, count - 2)), [1.0]])
+    velocities = np.concatenate([[0.0], rng.uniform(0.2, 0.6, count - 2), [0.0]])
+    plan = PiecewiseSpline.from_arrays(3.0 * places, places, derivatives={1: velocities})
+    found = fastest(plan, {"y_d1": 10.0, "y_d2": 1.0}, hold="path")
+    assert 2.0 <= found.duration <= 2.0 * 1.003
+    assert {jump.time for jump in found.plan.jumps(2)} <= {found.plan.start, found.plan.end}
+
+
 def test_a_plan_that_jumps_is_rejected():
     plan = MOVE.then(cp.Step(3.0, 1.0)).then(PolySpline([Waypoint(0, 3, 0, 0), Waypoint(1, 4, 0, 0)]))
     with pytest.raises(ValueError, match="plan must be continuous, got y that jumps by 2 at 1 s"):
@@ -228,6 +240,16 @@ CYCLE = TrigSpline.cyclic([Waypoint(0, [0, 0]), Waypoint(1, [3, 0]), Waypoint(2,
 def begun_later(plan, delay):
     """Closed plan that begins at another of its points."""
     return cp.Clipped(plan.then(plan), plan.start + delay, plan.end + delay)
+
+
+def test_the_acceleration_is_continuous_over_the_end_of_a_closed_path():
+    """Also where that of the plan is not: it begins and ends with another change of its speed."""
+    plan = Retimed(CYCLE, PolySpline([Waypoint(0, 0, 2.0), Waypoint(2, 3, 2.0)]))
+    assert np.abs(plan.jet(plan.start, 2) - plan.jet(plan.end, 2, left=True))[2].max() > 0.1
+    found = fastest(plan, LIMITS, hold="path")
+    first, last = found.plan.jet(found.plan.start, 2), found.plan.jet(found.plan.end, 2, left=True)
+    np.testing.assert_allclose(first, last, rtol=0, atol=1e-10)
+    assert found.duration == pytest.approx(fastest(CYCLE, LIMITS, hold="path").duration, rel=0.004)
 
 
 def test_the_start_of_a_closed_path_does_not_matter():

@@ -16,6 +16,9 @@ from ctrlplan.trajectories.common import Array, readonly
 _SHORT, _GROWTH = 1e-5, 0.35
 """Duration of the cell at a point of rest relative to its span, and the increase of lengths per length."""
 
+_BEND = 0.25
+"""Length of a cell relative to the time in which the plan's speed changes by its acceleration."""
+
 _CELLS, _PER_SPAN = 64, 8
 """Minimum number of cells of a plan, and of a span, without those at points of rest."""
 
@@ -52,9 +55,9 @@ class Grid:
         """Initial cells, short at points of rest."""
         spans = [(k, span) for k, part in enumerate(parts) for span in part.spans]
         count = max(_PER_SPAN, -(-_CELLS // len(spans)))
+        shortest = np.concatenate([_shortest(part, count) for part in parts]).tolist()
         edges = [
-            span.start + span.length * _fractions(count, *(round(power, 1) for power in span.rests))
-            for _, span in spans
+            span.start + span.length * _fractions(count, *pair) for (_, span), pair in zip(spans, shortest, strict=True)
         ]
         sizes = [own.size - 1 for own in edges]
         return cls(
@@ -79,45 +82,52 @@ class Grid:
         return np.array([span.segment for part in self.parts for span in part.spans])[self.span]
 
     @cached_property
-    def sizes(self) -> Array:
-        """Lengths of the cells by their unit of time."""
-        return self.length / self.units
+    def joints(self) -> tuple[Array, Array]:
+        """Ratios and bends of the plan from each cell to the next one."""
+        last = np.diff(self.span, append=-1) != 0
+        ratios, bends = np.ones(self.span.size), np.zeros(self.span.size)
+        ratios[last] = [ratio for part in self.parts for ratio in part.ratios]
+        bends[last] = [bend for part in self.parts for bend in part.bends]
+        return ratios, bends
 
-    @cached_property
-    def halts(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Cells that begin, and those that end, at a corner at which the law stops."""
+    def ends(self, rate: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Cells that begin, and those that end, with a prescribed squared rate."""
         first = np.flatnonzero(np.diff(self.part, prepend=-1))
         last = np.append(first[1:], self.part.size) - 1
-        chosen = np.array([part.halts for part in self.parts])
+        chosen = np.array([[own == rate for own in part.rates] for part in self.parts])
         return first[chosen[:, 0]], last[chosen[:, 1]]
 
-    @cached_property
-    def units(self) -> Array:
-        """Unit of time of each cell; lengths and derivatives by the unit join without jumps of the velocity."""
-        return np.array([unit for part in self.parts for unit in part.units])[self.span]
-
     def jets(self, fractions: Array) -> Array:
-        """Derivatives 1 and 2 of the plan (2, naxes, npoints, ncells), by the unit of time, at points of each cell."""
+        """Derivatives 1 and 2 of the plan (2, naxes, npoints, ncells) at points of each cell."""
         times = self.start[:, None] + self.length[:, None] * fractions
         found = self.plan.segments_jet(np.repeat(self.segment, fractions.size), times.ravel(), 2)[1:]
-        found = found.reshape(2, self.plan.naxes, self.start.size, fractions.size).transpose(0, 1, 3, 2)
-        return np.stack([found[0] * self.units, found[1] * self.units**2])
+        return found.reshape(2, self.plan.naxes, self.start.size, fractions.size).transpose(0, 1, 3, 2)
 
     def times(self, fractions: Array) -> Array:
         """Times of the plan [s] (npoints, ncells)."""
         return self.plan.breakpoints[self.segment] + self.start + self.length * fractions[:, None]
 
 
+def _shortest(part: Part, count: int) -> Array:
+    """Lengths (nspans, 2) of the first and last cell of each span, relative to the span."""
+    lengths = np.array([span.length for span in part.spans])
+    powers = np.array([span.rests for span in part.spans])
+    # With constant acceleration from rest the distance is the time to the power 2/(power + 1).
+    found = np.where(powers > 0.0, _SHORT ** (2.0 / (np.maximum(powers, 2.0) + 1.0)), 1.0 / count)
+    with np.errstate(divide="ignore"):
+        bends = _BEND / np.maximum(np.abs(part.bends), 1e-300)
+    found[:, 1] = np.minimum(found[:, 1], bends / lengths)
+    following = np.roll(bends / np.array(part.ratios), 1)  # in the time of the next span
+    found[:, 0] = np.minimum(found[:, 0], following / lengths)
+    return 2.0 ** (0.5 * np.floor(2.0 * np.log2(np.maximum(found, _SHORT))))
+
+
 @lru_cache(maxsize=64)
 def _fractions(count: int, first: float, last: float) -> Array:
-    """Edges of the cells of a span, from 0 to 1, for powers of the velocity at both ends."""
+    """Edges of the cells of a span, from 0 to 1, for the lengths of the first and last cell."""
     fine = np.geomspace(1e-4, 0.5, 200)
     u = np.concatenate([[0.0], fine, 1.0 - fine[-2::-1], [1.0]])
-    size = np.full(u.shape, 1.0 / count)
-    for power, distance in ((first, u), (last, 1.0 - u)):
-        if power:
-            # With constant acceleration the distance is the time to the power 2/(power + 1).
-            size = np.minimum(size, _SHORT ** (2.0 / (max(power, 2.0) + 1.0)) + _GROWTH * distance)
+    size = np.minimum(1.0 / count, np.minimum(first + _GROWTH * u, last + _GROWTH * (1.0 - u)))
     passed = np.concatenate([[0.0], np.cumsum(np.diff(u) * 0.5 * (1.0 / size[1:] + 1.0 / size[:-1]))])
     cells = int(np.ceil(passed[-1]))
     edges = np.interp(np.linspace(0.0, passed[-1], cells + 1), passed, u)
@@ -150,27 +160,29 @@ class Spline:
     @classmethod
     def of(cls, grid: Grid) -> Spline:
         """Spline on a grid."""
-        h = grid.sizes
+        h, ratios, bends = grid.length, *grid.joints
         index, extraction = np.empty((3, h.size), dtype=np.intp), np.zeros((3, 3, h.size))
         extraction[1, 1] = 1.0
         size, bandwidth, fixed = 0, 2, []
         firsts = np.flatnonzero(np.diff(grid.part, prepend=-1)).tolist()
         for part, begin, end in zip(grid.parts, firsts, [*firsts[1:], h.size], strict=True):
-            own, cells = h[begin:end], np.arange(end - begin)
-            count = own.size
-            before, after = np.roll(own, 1), np.roll(own, -1)
-            extraction[0, 0, begin:end], extraction[0, 1, begin:end] = own / (before + own), before / (before + own)
-            extraction[2, 1, begin:end], extraction[2, 2, begin:end] = after / (own + after), own / (own + after)
+            cells, count, own = np.arange(end - begin), end - begin, slice(begin, end)
+            # b and its slope along the path, 2 (x - b)/h on both sides, are continuous, with the speed of the plan.
+            before, after = 1.0 / h[own], ratios[own] / np.roll(h[own], -1)
+            total = before + after - np.minimum(bends[own], 0.5 * (before + after))
+            extraction[2, 1, own], extraction[2, 2, own] = before / total, after / ratios[own] ** 2 / total
+            extraction[0, 0, own] = np.roll(extraction[2, 1, own] * ratios[own] ** 2, 1)
+            extraction[0, 1, own] = np.roll(extraction[2, 2, own] * ratios[own] ** 2, 1)
             if part.closed:
-                index[:, begin:end] = size + _interleaved(count)[(cells + np.arange(-1, 2)[:, None]) % count]
+                index[:, own] = size + _interleaved(count)[(cells + np.arange(-1, 2)[:, None]) % count]
                 size, bandwidth = size + count, 4
                 fixed += [False] * count
                 continue
-            index[:, begin:end] = size + cells + np.arange(3)[:, None]
+            index[:, own] = size + cells + np.arange(3)[:, None]
             extraction[0, :2, begin] = 1.0, 0.0
             extraction[2, 1:, end - 1] = 0.0, 1.0
             size += count + 2
-            fixed += [part.halts[0], *[False] * count, part.halts[1]]
+            fixed += [part.rates[0] is not None, *[False] * count, part.rates[1] is not None]
         return cls(index, extraction, size, bandwidth, np.array(fixed))
 
     def coefficients(self, x: Array) -> Array:

@@ -17,6 +17,9 @@ _GAP = 1e-3
 
 _ROUNDS = 60
 
+_NEAREST = 0.02
+"""Minimum of the slacks at the start, relative to the limits."""
+
 _STEP = 0.98
 """Step relative to the longest one within the inequalities."""
 
@@ -64,7 +67,13 @@ def minimum(problem: Problem, start: Array) -> Array:
     problem : Problem
         Objective and inequalities.
     start : ndarray, shape (size,)
-        Coefficients that satisfy all inequalities strictly; 0 where prescribed.
+        Coefficients, positive where not prescribed, that satisfy all inequalities or
+        nearly so.
+
+    Raises
+    ------
+    ValueError
+        If no coefficients that satisfy the inequalities are found.
     """
     return _Search(problem, start).minimum()
 
@@ -76,6 +85,7 @@ class _Search:
         spline = problem.spline
         self._index, self._size, self._bandwidth = spline.index, spline.size, spline.bandwidth
         self._fixed, self._scale = spline.fixed, np.where(spline.fixed, 1.0, start)
+        self._start = np.where(spline.fixed, start, 1.0)
         own = self._scale[spline.index]
         self._points, self._weights = problem.points * own[:, None], problem.weights
         self._rows, self._upper, self._lower = problem.rows * own[:, None], problem.upper, problem.lower
@@ -85,29 +95,34 @@ class _Search:
 
     def minimum(self) -> Array:
         """Coefficients at the optimum."""
-        x = np.where(self._fixed, 0.0, 1.0)
-        w = self._slacks(x)
+        x = self._start
+        w = np.maximum(self._slacks(x), _NEAREST)
         active: Array = np.append(np.ones(w.size - x.size), np.where(self._fixed, 0.0, 1.0))
         # At the optimum the sum of the multipliers of normalised limits is half the duration.
         y = active * 0.5 * self._duration(x) / (active / w).sum() / w
         for _ in range(_ROUNDS):
             gradient, curvature = self._objective(x)
+            missed = self._slacks(x) - w
             gap, tolerance = float(y @ w), _GAP * self._duration(x)
             residual = np.where(self._fixed, 0.0, x * (gradient - self._pulled(y)))
-            if gap < tolerance and np.abs(residual).sum() < tolerance:
-                break
+            if gap < tolerance and np.abs(residual).sum() < tolerance and missed.min() > -1e-9:
+                return self._scale * x
             solve = self._solver(curvature, y / w)
-            dx = solve(-gradient)
-            dw = self._changes(dx)
+            dx = solve(-gradient - self._pulled(y * missed / w))
+            dw = self._changes(dx) + missed
             dy = -y - y * dw / w
             reached = float((w + _longest(w, dw) * dw) @ (y + _longest(y, dy) * dy))
             target = active * (gap / active.sum() * (reached / gap) ** 3 - dw * dy)
-            dx = solve(self._pulled(target / w) - gradient)
-            dw = self._changes(dx)
+            dx = solve(self._pulled((target - y * missed) / w) - gradient)
+            dw = self._changes(dx) + missed
             dy = (target - y * dw) / w - y
             primal, dual = (min(1.0, _STEP * _longest(own, change, 2.0)) for own, change in ((w, dw), (y, dy)))
             x, w, y = x + primal * dx, w + primal * dw, y + dual * dy
-        return self._scale * x
+        if missed.min() > -1e-9:
+            return self._scale * x
+        raise ValueError(
+            "limits must be satisfied with the speeds at the ends of the plan, got none that are; lower these speeds"
+        )
 
     def _duration(self, x: Array) -> float:
         return float((self._weights / np.sqrt(_applied(self._points, x[self._index]))).sum())

@@ -48,7 +48,13 @@ class FastLaw:
     stops: tuple[float, ...]
 
 
-def fastest_law(plan: Trajectory, bounds: Sequence[Bound], start: float) -> FastLaw:
+def fastest_law(
+    plan: Trajectory,
+    bounds: Sequence[Bound],
+    start: float,
+    fixed: tuple[bool, bool] = (False, False),
+    reserve: float = 0.0,
+) -> FastLaw:
     """Time law of minimum duration under limits of velocities and accelerations.
 
     Parameters
@@ -59,35 +65,46 @@ def fastest_law(plan: Trajectory, bounds: Sequence[Bound], start: float) -> Fast
         Limits of first and second derivatives of axes.
     start : float
         Start [s] of the plan for which limits over time are given.
+    fixed : (bool, bool), optional
+        Whether the velocities of the plan at its ends are kept.
+    reserve : float, optional
+        Distance from the limits, relative to them.
 
     Raises
     ------
     ValueError
-        If the rate is not limited.
+        If the rate is not limited, or velocities at the ends are infeasible.
     """
-    parts = parts_of(plan, any(bound.order == 2 for bound in bounds))
+    edges = [time - start + plan.start for bound in bounds for time in _changes(bound)]
+    parts = parts_of(plan, any(bound.order == 2 for bound in bounds), edges, fixed)
     grid = Grid.of(plan, [part for part in parts if part.moves])
     for refinement in range(_REFINEMENTS + 1):
         spline, activity = Spline.of(grid), Activity.of(grid, bounds, POINTS, start)
-        rows = activity.rows(grid.sizes)
+        rows = activity.rows(grid.length).with_reserve(reserve, *grid.ends(1.0))
         problem = _problem(grid, spline, rows)
         x = swept(grid, spline, rows)
-        x = minimum(problem, _START * problem.feasible_scale(x) * x)
+        scale = _START * problem.feasible_scale(x) if not any(fixed) else _START
+        x = minimum(problem, np.where(spline.fixed, x, scale * x))
         local = spline.coefficients(x)
-        loss = _losses(activity.worst(POINTS, local, grid.sizes), local, grid.sizes)
+        loss = _losses(activity.worst(POINTS, local, grid.length), local, grid.length)
         if loss.sum() < _LOSS or refinement == _REFINEMENTS:
             break
         grid = grid.divided(np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int))
     return FastLaw(Retimed(plan, _law(plan, parts, grid, local)), _corners(plan, parts))
 
 
+def _changes(bound: Bound) -> tuple[float, ...]:
+    """Times [s] of the given plan at which limits begin, end or have a kink."""
+    return (*(bound.interval or ()), *(bound.profile.times if bound.profile is not None else ()))
+
+
 def _problem(grid: Grid, spline: Spline, rows: Rows) -> Problem:
     """Duration by quadrature, and inequalities, for the coefficients of a spline."""
-    values = np.repeat(basis(_NODES)[0][:, None], grid.sizes.size, axis=1)
-    weights = _WEIGHTS[:, None] * grid.sizes
+    values = np.repeat(basis(_NODES)[0][:, None], grid.length.size, axis=1)
+    weights = _WEIGHTS[:, None] * grid.length
     # 1/sqrt(b) is integrated by the square root of the distance from a point at which b is 0.
     root = 2.0 * _NODES[:, None]
-    first, last = grid.halts
+    first, last = grid.ends(0.0)
     values[:, first], weights[:, first] = basis(_NODES**2)[0][:, None], weights[:, first] * root
     values[:, last], weights[:, last] = basis(1.0 - _NODES**2)[0][:, None], weights[:, last] * root
     return Problem(spline, spline.rows(values), weights, spline.rows(rows.factors), rows.upper, rows.lower)
@@ -105,14 +122,14 @@ def _law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array) -> T
     dwells = [span for part in parts if not part.moves for span in part.spans]
     own = [plan.breakpoints[span.segment] + span.start for span in dwells]
     places = np.append(plan.breakpoints[grid.segment] + grid.start, own)
-    rates = np.append(local * grid.units**2, np.ones((3, len(own))), axis=1)
+    rates = np.append(local, np.ones((3, len(own))), axis=1)
     order = np.argsort(places)
     return TimeLaw(np.append(places[order], plan.end), rates[:, order], plan.start)
 
 
 def _corners(plan: Trajectory, parts: Sequence[Part]) -> tuple[float, ...]:
     """Times [s] of the plan at which its path has a corner."""
-    ends, starts = ([part for part in parts if part.moves and part.halts[side]] for side in (1, 0))
+    ends, starts = ([part for part in parts if part.moves and part.rates[side] == 0.0] for side in (1, 0))
     times = [plan.breakpoints[part.spans[-1].segment] + part.spans[-1].end for part in ends]
     times += [plan.breakpoints[part.spans[0].segment] + part.spans[0].start for part in starts]
     return tuple(np.unique(times).tolist())

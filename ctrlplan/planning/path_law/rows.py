@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.path_law.grid import Grid
@@ -40,6 +41,14 @@ class Rows:
     factors: Array
     upper: Array
     lower: Array
+
+    def with_reserve(self, reserve: float, first: NDArray[np.intp], last: NDArray[np.intp]) -> Rows:
+        """Rows at a distance from the limits, without those of the given speeds where cells begin or end."""
+        if not (reserve or first.size or last.size):
+            return self
+        upper = (1.0 - reserve) * self.upper
+        upper[-_POINTS.size, first] = upper[-1, last] = _FAR
+        return Rows(self.factors, upper, (1.0 - reserve) * self.lower)
 
 
 def basis(u: Array) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -54,17 +55,23 @@ class Part:
     ----------
     spans : tuple of Span
         The spans.
-    units : tuple of float
-        Unit of time of each span, with which the tangent of the path is continuous.
-    halts : (bool, bool)
-        Whether the path has a corner at each end, at which it must be at rest.
+    ratios : tuple of float
+        Speed of the plan at the end of each span relative to that at the start of the
+        next one.
+    bends : tuple of float
+        Acceleration of the plan along its velocity, relative to it [1/s]: increase
+        from the end of each span to the start of the next one, with its speed there.
+    rates : (float or None, float or None)
+        Prescribed squared rates at both ends: 0 at a corner of the path, at which it
+        must be at rest; None for free ones.
     closed : bool
         Whether the end is continued by the start.
     """
 
     spans: tuple[Span, ...]
-    units: tuple[float, ...]
-    halts: tuple[bool, bool]
+    ratios: tuple[float, ...]
+    bends: tuple[float, ...]
+    rates: tuple[float | None, float | None]
     closed: bool = False
 
     @property
@@ -73,7 +80,9 @@ class Part:
         return self.spans[0].moves
 
 
-def parts_of(plan: Trajectory, stops: bool) -> list[Part]:
+def parts_of(
+    plan: Trajectory, stops: bool, edges: Sequence[float] = (), fixed: tuple[bool, bool] = (False, False)
+) -> list[Part]:
     """Parts of a plan, dwells included.
 
     Parameters
@@ -82,22 +91,31 @@ def parts_of(plan: Trajectory, stops: bool) -> list[Part]:
         Plan with a duration and without jumps of the position.
     stops : bool
         Whether the plan stops at corners of the path.
+    edges : sequence of float, optional
+        Times [s] at which limits change.
+    fixed : (bool, bool), optional
+        Whether the plan keeps its velocities at both ends.
     """
-    spans, joints = _spans(plan, stops)
+    spans, joints = _spans(plan, stops, edges)
     ends = [0, *(k + 1 for k, joint in enumerate(joints) if joint.stops), len(spans)]
     parts = []
     for first, last in pairwise(ends):
-        ratios = [joints[k].ratio for k in range(first, last - 1)]
-        units = np.cumprod([1.0, *ratios]).tolist()
-        halts = (first > 0 and joints[first - 1].corner, last < len(spans) and joints[last - 1].corner)
-        halts = (halts[0] and not spans[first].rests[0], halts[1] and not spans[last - 1].rests[1])
-        parts.append(Part(tuple(spans[first:last]), tuple(units), halts))
-    if len(parts) == 1 and _is_closed(plan):
-        return [replace(parts[0], halts=(False, False), closed=True)]
-    if spans[0].moves and spans[-1].moves and _is_closed(plan):  # the last part leads into the first
-        begin, end = parts[0], parts.pop()
-        units = (*end.units, *(end.units[-1] * unit for unit in begin.units))
-        parts[0] = Part(end.spans + begin.spans, units, (end.halts[0], begin.halts[1]))
+        inner = [*joints[first : last - 1], _Joint(True, False)]
+        start = (1.0 if fixed[0] else None) if first == 0 else 0.0 if joints[first - 1].corner else None
+        end = (1.0 if fixed[1] else None) if last == len(spans) else 0.0 if joints[last - 1].corner else None
+        rates = None if spans[first].rests[0] else start, None if spans[last - 1].rests[1] else end
+        ratios, bends = tuple(joint.ratio for joint in inner), tuple(joint.bend for joint in inner)
+        parts.append(Part(tuple(spans[first:last]), ratios, bends, rates))
+    closing = _closing(plan) if spans[0].moves and spans[-1].moves and not any(fixed) else None
+    if closing is None:
+        return parts
+    begin, end = parts[0], parts[-1]
+    ratios, bends = (*end.ratios[:-1], closing.ratio), (*end.bends[:-1], closing.bend)
+    if len(parts) == 1:
+        return [replace(begin, ratios=ratios, bends=bends, closed=True)]
+    # The last part leads into the first.
+    rates = end.rates[0], begin.rates[1]
+    parts[0] = Part(parts.pop().spans + begin.spans, ratios + begin.ratios, bends + begin.bends, rates)
     return parts
 
 
@@ -113,11 +131,14 @@ class _Joint:
         Whether it must stop because the direction changes.
     ratio : float
         Speed before the point relative to that after it.
+    bend : float
+        Increase of the acceleration along the velocity, relative to it [1/s].
     """
 
     stops: bool
     corner: bool
-    ratio: float
+    ratio: float = 1.0
+    bend: float = 0.0
 
 
 def _joint(before: Array, after: Array, still: Array, stops: bool = True) -> _Joint:
@@ -126,23 +147,27 @@ def _joint(before: Array, after: Array, still: Array, stops: bool = True) -> _Jo
     if all(rests):
         # A reversal with acceleration is passed without a break.
         passes = (np.abs(after[2] - before[2]) <= 1e3 * still[1]).all() and (np.abs(after[2]) > 1e3 * still[1]).any()
-        return _Joint(not passes, False, 1.0)
+        return _Joint(not passes, False)
     moving = still[0] > 0.0
     tangents = [jet[1, moving] / still[0, moving] for jet in (before, after)]
     sizes = [float(np.linalg.norm(tangent)) for tangent in tangents]
     if any(rests) or (np.abs(tangents[0] / sizes[0] - tangents[1] / sizes[1]) > 1e-7).any():
-        return _Joint(stops, stops, 1.0)
-    return _Joint(False, False, sizes[0] / sizes[1] if abs(sizes[0] / sizes[1] - 1.0) > 1e-12 else 1.0)
+        return _Joint(stops, stops)
+    ratio = sizes[0] / sizes[1] if abs(sizes[0] / sizes[1] - 1.0) > 1e-12 else 1.0
+    jump = (ratio**2 * after[2, moving] - before[2, moving]) / still[0, moving]
+    bend = float(jump @ tangents[0]) / sizes[0] ** 2
+    return _Joint(False, False, ratio, bend)
 
 
-def _spans(plan: Trajectory, stops: bool) -> tuple[list[Span], list[_Joint]]:
+def _spans(plan: Trajectory, stops: bool, edges: Sequence[float]) -> tuple[list[Span], list[_Joint]]:
     """Spans between breakpoints and waypoints, and the points between them."""
     segments, starts, ends = [], [], []
-    inner = np.array([waypoint.time for waypoint in plan.waypoints])
+    inner = np.unique([*(waypoint.time for waypoint in plan.waypoints), *edges])
     for segment, (left, right) in enumerate(pairwise(plan.breakpoints.tolist())):
         slack = 1e-9 * (right - left)
-        edges = [0.0, *(inner[(inner > left + slack) & (inner < right - slack)] - left).tolist(), right - left]
-        for first, last in pairwise(edges):
+        own = inner[(inner > left + slack) & (inner < right - slack)] - left
+        own = own[np.diff(own, prepend=0.0) > slack]
+        for first, last in pairwise([0.0, *own.tolist(), right - left]):
             segments.append(segment)
             starts.append(first)
             ends.append(last)
@@ -160,7 +185,7 @@ def _spans(plan: Trajectory, stops: bool) -> tuple[list[Span], list[_Joint]]:
     joints = [
         _joint(jets[:, :, k, -1], jets[:, :, k + 1, 0], still, stops)
         if spans[k].moves and spans[k + 1].moves
-        else _Joint(True, stops, 1.0)
+        else _Joint(True, stops)
         for k in range(len(spans) - 1)
     ]
     return spans, joints
@@ -175,12 +200,12 @@ def _powers(velocities: Array) -> list[list[float]]:
     return np.where(rests & np.isfinite(powers), np.clip(powers, 1.0, None), 0.0).tolist()
 
 
-def _is_closed(plan: Trajectory) -> bool:
-    """Whether the end of a plan is continued by its start, in motion or with acceleration."""
+def _closing(plan: Trajectory) -> _Joint | None:
+    """Joint of the end of a closed plan with its start, if it is in motion or accelerated there; otherwise None."""
     first, last = plan.jet(plan.start, 2), plan.jet(plan.end, 2, left=True)
     extrema = plan.extrema()
     slack = 1e-9 * (extrema.maximum - extrema.minimum) + 1e-14 * np.abs(first[0])
     if (np.abs(last[0] - first[0]) > slack).any():
-        return False
+        return None
     joint = _joint(last, first, _STILL * np.stack([plan.peak(1), plan.peak(2)]))
-    return not joint.stops and abs(joint.ratio - 1.0) <= 1e-7
+    return None if joint.stops or abs(joint.ratio - 1.0) > 1e-7 else joint

@@ -16,109 +16,66 @@ _FAR = 1e30
 
 
 def swept(grid: Grid, spline: Spline, rows: Rows) -> Array:
-    """Coefficients of a feasible spline, near the fastest one.
+    """Coefficients of a spline near the fastest one, feasible up to a factor.
 
     Backwards each cell limits the squared rate at its start to the largest one from
     which some feasible rate at its end is reached; forwards each cell is passed
     with the largest rate at its end.
+
+    Raises
+    ------
+    ValueError
+        If the rate is not limited.
     """
-    cells = _Cells.of(rows)
-    x = np.empty(spline.size)
+    cells, x = _Cells(rows, grid.joints[0] ** 2), np.empty(spline.size)
     firsts = np.flatnonzero(np.diff(grid.part, prepend=-1)).tolist()
     for part, begin, end in zip(grid.parts, firsts, [*firsts[1:], grid.part.size], strict=True):
-        nodes = cells.closed(begin, end) if part.closed else cells.open(begin, end, part.halts)
-        middles = 0.5 * (nodes[:-1] + nodes[1:])
-        if not nodes.max() < 1e-3 * _FAR:
+        starts = cells.closed(begin, end) if part.closed else cells.open(begin, end, part.rates)
+        if not starts.max() < 1e-3 * _FAR:
             raise ValueError(
                 "limits must bound the speed along the whole path, got a part of it with limits of accelerations only "
                 "that starts and ends in motion; limit the velocities"
             )
-        index = spline.index[:, begin:end]
+        index, ends = spline.index[:, begin:end], starts[1:] / cells.gains[begin:end]
         if not part.closed:
-            x[index[0, 0]], x[index[2, -1]] = nodes[0], nodes[-1]
-        x[index[1]] = middles
+            x[index[0, 0]], x[index[2, -1]] = starts[0], ends[-1]
+        x[index[1]] = 0.5 * (starts[:-1] + ends)
     return x
 
 
 class _Cells:
-    """Feasible pairs (y, z) of the squared rates at both ends of each cell: a y + c z <= 1 for all rows."""
+    """Feasible pairs (y, z) of the squared rates at both ends of each cell: a y + c z <= 1 for all rows.
 
-    def __init__(self, start: Array, end: Array) -> None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            backward, forward = start > 1e-14 * np.abs(end), end > 1e-14 * np.abs(start)
-            self._start = np.where(backward, 1.0 / start, _FAR), np.where(backward, end / start, 0.0)
-            self._end = np.where(forward, 1.0 / end, _FAR), np.where(forward, start / end, 0.0)
-        self._peak = self._peaks()
+    Attributes
+    ----------
+    gains : ndarray, shape (ncells,)
+        Factors of the squared rate from the end of each cell to the start of the next one.
+    """
 
-    @classmethod
-    def of(cls, rows: Rows) -> _Cells:
+    def __init__(self, rows: Rows, gains: Array) -> None:
         start = rows.factors[..., 0] + 0.5 * rows.factors[..., 1]
         end = rows.factors[..., 2] + 0.5 * rows.factors[..., 1]
         two = len(rows.lower)
-        pairs = [np.concatenate([own / rows.upper, own[:two] / rows.lower]).T.copy() for own in (start, end)]
-        return cls(*pairs)
+        start, end = (np.concatenate([own / rows.upper, own[:two] / rows.lower]).T.copy() for own in (start, end))
+        self.gains = gains
+        self._of_end, self._of_start = _lines(start, end), _lines(end, start)
+        self._best_end, self._largest_start = _peaks(*self._of_end)
 
-    def _peaks(self) -> tuple[Array, Array]:
-        """Rates z at the ends for which the rates y at the starts are largest, and these, for all cells."""
-        low, high = np.zeros(len(self._start[0])), np.full(len(self._start[0]), _FAR)
-        offset, slope = self._start
-        cell = np.arange(low.size)
-        # The minimum of lines is concave: intersect the active line of positive slope with that of negative slope.
-        for _ in range(30):
-            values_low = offset - slope * low[:, None]
-            values_high = offset - slope * high[:, None]
-            i, j = values_low.argmin(axis=1), values_high.argmin(axis=1)
-            rise, fall = -slope[cell, i], -slope[cell, j]
-            moving = (rise > 0.0) & (fall < 0.0)
-            if not moving.any():
-                break
-            with np.errstate(divide="ignore", invalid="ignore"):
-                z = (offset[cell, i] - offset[cell, j]) / (fall - rise)
-            z = np.where(moving, np.clip(z, low, high), low)
-            k = (offset - slope * z[:, None]).argmin(axis=1)
-            up = moving & (-slope[cell, k] > 0.0)
-            done = moving & ((k == i) | (k == j))
-            low, high = np.where(up | done, z, low), np.where((moving & ~up) | done, z, high)
-        best = np.where(-slope[cell, (offset - slope * low[:, None]).argmin(axis=1)] > 0.0, high, low)
-        return best, (offset - slope * best[:, None]).min(axis=1)
-
-    def _back(self, k: int, z: float) -> float:
-        """Largest rate at the start of a cell from which a rate of at most z at its end is reached."""
-        if z >= self._peak[0][k]:
-            return float(self._peak[1][k])
-        return float((self._start[0][k] - self._start[1][k] * z).min())
-
-    def _on(self, k: int, y: float) -> float:
-        """Largest rate at the end of a cell with rate y at its start."""
-        return float((self._end[0][k] - self._end[1][k] * y).min())
-
-    def open(self, begin: int, end: int, halts: tuple[bool, bool]) -> Array:
-        """Rates at the ends of the cells of an open part."""
+    def open(self, begin: int, end: int, rates: tuple[float | None, float | None]) -> Array:
+        """Rates at the starts of the cells of an open part, and at its end, some of which may be prescribed."""
         limit = np.empty(end - begin + 1)
-        limit[-1] = 0.0 if halts[1] else min(_FAR, self._largest_end(end - 1))
+        limit[-1] = self._largest_end(end - 1) if rates[1] is None else rates[1]
         self._backward(limit, begin)
-        if halts[0]:
-            limit[0] = 0.0
-        return self._forward(limit, begin)
-
-    def _largest_end(self, k: int) -> float:
-        """Largest rate at the end of a cell, over all rates at its start."""
-        mirrored = _Cells.__new__(_Cells)
-        mirrored._start = self._end[0][k : k + 1], self._end[1][k : k + 1]
-        return float(mirrored._peaks()[1][0])
-
-    def _backward(self, limit: Array, begin: int) -> None:
-        for k in range(limit.size - 2, -1, -1):
-            limit[k] = self._back(begin + k, limit[k + 1])
-
-    def _forward(self, limit: Array, begin: int) -> Array:
-        nodes = limit.copy()
-        for k in range(limit.size - 1):
-            nodes[k + 1] = min(limit[k + 1], self._on(begin + k, nodes[k]))
+        if rates[0] is not None:
+            _check_speed("start", rates[0], limit[0])
+            limit[0] = rates[0]
+        nodes = self._forward(limit, begin)
+        if rates[1] is not None:
+            _check_speed("end", rates[1], nodes[-1])
         return nodes
 
     def closed(self, begin: int, end: int) -> Array:
-        """Rates at the ends of the cells of a closed part."""
+        """The same for a closed part."""
         limit = np.full(end - begin + 1, self._largest_end(end - 1))
         for _ in range(_ROUNDS):
             self._backward(limit, begin)
@@ -128,3 +85,64 @@ class _Cells:
             limit[0] = nodes[-1]
         nodes[0] = nodes[-1]
         return nodes
+
+    def _largest_end(self, cell: int) -> float:
+        """Largest rate after the end of a cell, over all rates at its start."""
+        offset, slope = self._of_start
+        return float(_peaks(offset[cell : cell + 1], slope[cell : cell + 1])[1][0] * self.gains[cell])
+
+    def _backward(self, limit: Array, begin: int) -> None:
+        offset, slope = self._of_end
+        for k in range(limit.size - 2, -1, -1):
+            cell = begin + k
+            z = limit[k + 1] / self.gains[cell]
+            beyond = z >= self._best_end[cell]
+            limit[k] = self._largest_start[cell] if beyond else (offset[cell] + slope[cell] * z).min()
+
+    def _forward(self, limit: Array, begin: int) -> Array:
+        offset, slope = self._of_start
+        nodes = limit.copy()
+        for k in range(limit.size - 1):
+            cell = begin + k
+            nodes[k + 1] = min(limit[k + 1], self.gains[cell] * (offset[cell] + slope[cell] * nodes[k]).min())
+        return nodes
+
+
+def _check_speed(where: str, rate: float, largest: float) -> None:
+    if rate > largest * (1.0 + 1e-9):
+        reason = "slow down for the path that follows" if where == "start" else "be reached"
+        raise ValueError(
+            f"the speed at the {where} must {reason} within the limits, got that of the plan where at most "
+            f"{largest**0.5:.6g} of it may be"
+        )
+
+
+def _lines(one: Array, other: Array) -> tuple[Array, Array]:
+    """Offsets and slopes (ncells, nrows) of the upper limits of a rate by the rate at the other end."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        limits = one > 1e-14 * np.abs(other)
+        return np.where(limits, 1.0 / one, _FAR), np.where(limits, -other / one, 0.0)
+
+
+def _peaks(offset: Array, slope: Array) -> tuple[Array, Array]:
+    """Place of at least 0 and value of the maximum of the minimum of lines, for each cell."""
+    cell = np.arange(len(offset))
+    low, high = np.zeros(cell.size), np.full(cell.size, _FAR)
+    for _ in range(30):
+        i, j = (offset + slope * low[:, None]).argmin(axis=1), (offset + slope * high[:, None]).argmin(axis=1)
+        rise, fall = slope[cell, i], slope[cell, j]
+        moving = (rise > 0.0) & (fall < 0.0)
+        if not moving.any():
+            break
+        # The minimum is concave: intersect the line that is active on the left with that on the right.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = (offset[cell, j] - offset[cell, i]) / (rise - fall)
+        z = np.where(moving, np.clip(z, low, high), low)
+        k = (offset + slope * z[:, None]).argmin(axis=1)
+        done = (k == i) | (k == j)
+        increases = slope[cell, k] > 0.0
+        low = np.where(moving & (increases | done), z, low)
+        high = np.where(moving & (~increases | done), z, high)
+    rises = slope[cell, (offset + slope * low[:, None]).argmin(axis=1)] > 0.0
+    best = np.where(rises, high, low)
+    return best, (offset + slope * best[:, None]).min(axis=1)
