@@ -70,6 +70,7 @@ from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start
 from ctrlplan.simulation.response import SimulationResponse, signal_table
+from ctrlplan.simulation.sampled_response import SampledQuantities
 from ctrlplan.simulation.simulate import simulate
 from ctrlplan.simulation.simulated_response import SimulatedQuantities
 from ctrlplan.simulation.starts import check_begin
@@ -83,6 +84,7 @@ __all__ = [
     "Occurrence",
     "Predictor",
     "Prepared",
+    "SampledQuantities",
     "SimulatedQuantities",
     "SimulationResponse",
     "SolverError",

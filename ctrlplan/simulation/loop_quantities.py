@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ctrlplan._checks import check_kind
+from ctrlplan._checks import check_kind, checked_finite
 from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, System
 from ctrlplan.simulation.equilibrium import linear_equilibrium
@@ -18,6 +18,7 @@ from ctrlplan.simulation.loop_inputs import Fed, fed_signals, same_axis, tracked
 from ctrlplan.simulation.loop_response import LoopResponse
 from ctrlplan.simulation.plan_cells import PlanCells
 from ctrlplan.simulation.prepared import Prepared, prepared_form
+from ctrlplan.simulation.sampled_response import SampledQuantities, has_exact_signals
 from ctrlplan.simulation.shape_family import LoopSignal, ShapeFamily
 from ctrlplan.simulation.simulated_response import SimulatedQuantities
 from ctrlplan.trajectories import Trajectory
@@ -183,7 +184,9 @@ class AlongPlan:
         return ExactResponse(motion, self.signals, plan)
 
 
-def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> LoopQuantities | SimulatedQuantities:
+def loop_quantities(
+    loop: System | Prepared, *, tail: float | None = None
+) -> LoopQuantities | SampledQuantities | SimulatedQuantities:
     """Signals of a loop along a plan, for limits on them.
 
     `fastest` and `margins` call it for a loop that they are given. The plan is
@@ -195,8 +198,9 @@ def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> Lo
     Parameters
     ----------
     loop : control system or Prepared
-        Loop, closed or open. The response of a linear continuous one is exact,
-        that of others is simulated.
+        Loop, closed or open. The response of a linear continuous one is exact, and
+        that of a linear one with discrete blocks whose sample times repeat. That of
+        others is simulated.
     tail : float, optional
         Time after the plan [s] over which a simulated response is considered;
         default: the duration of the plan. Exact responses are considered at all
@@ -204,7 +208,7 @@ def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> Lo
 
     Returns
     -------
-    LoopQuantities or SimulatedQuantities
+    LoopQuantities, SampledQuantities or SimulatedQuantities
         With the attributes ``names`` and ``inputs``, and the method
         ``quantities_of(plan)``.
 
@@ -213,8 +217,8 @@ def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> Lo
     TypeError
         If `loop` is not a control system.
     ValueError
-        If `tail` is negative, a discrete loop has no sampling time, or a linear
-        discrete loop is unstable.
+        If `tail` is negative, a discrete loop has no sampling time, or a linear loop
+        with discrete blocks, or in discrete time, is unstable.
 
     Examples
     --------
@@ -226,7 +230,13 @@ def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> Lo
     (0.0, 1.4445, 1.96)
     """
     prepared = prepared_form(loop)
-    return LoopQuantities(prepared) if prepared.linear is not None else SimulatedQuantities(prepared, tail)
+    if prepared.linear is not None:
+        return LoopQuantities(prepared)
+    if prepared.sampled is not None and has_exact_signals(prepared.sampled):
+        if tail is not None:
+            checked_finite(tail, "tail", minimum=0.0)
+        return SampledQuantities(prepared, prepared.sampled)
+    return SimulatedQuantities(prepared, tail)
 
 
 def _fed_by_sources(form: LinearForm, plan: Trajectory, name: str) -> list[Fed | None]:

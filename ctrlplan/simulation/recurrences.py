@@ -12,8 +12,17 @@ from ctrlplan._types import Array
 _PATTERN = 8
 """Minimum number of repetitions of a pattern of steps that are computed together."""
 
-_FEW = 12
-"""Number of states up to which blocks of different steps are faster than single steps."""
+_TRIED = 64
+"""Maximum number of lengths of a pattern that are tried."""
+
+_FEW = 16
+"""Number of states up to which blocks of different steps side by side are faster than single steps."""
+
+_TOGETHER = 2**15
+"""Number of different steps whose products are stored together."""
+
+_STEPS = 512
+"""Number of steps without a pattern from which growth is estimated."""
 
 
 def repeated(state: Array, change: Array, forced: Array | None, count: int) -> Array:
@@ -63,7 +72,34 @@ def marched(state: Array, matrices: Array, kinds: NDArray[np.intp], forced: Arra
     first, length = _pattern(kinds)
     if length:
         return _in_pattern(state, matrices, kinds, forced, first, length)
-    return _one_by_one(state, matrices, kinds, forced)
+    if state.size > _FEW or kinds.size < _FEW**2:
+        return _one_by_one(state, matrices, kinds, forced)
+    found = np.empty((kinds.size + 1, state.size))
+    found[0] = state
+    for begin in range(0, kinds.size, _TOGETHER):
+        some = slice(begin, begin + _TOGETHER)
+        after = _in_blocks(found[begin], matrices, kinds[some], forced[some])
+        found[begin + 1 : begin + 1 + len(after)] = after
+    return found if np.isfinite(found).all() else _one_by_one(state, matrices, kinds, forced)
+
+
+def growth(matrices: Array, kinds: NDArray[np.intp]) -> float:
+    """Growth of a perturbation of the states over the steps of given kinds, about; infinite if it overflows."""
+    first, length = _pattern(kinds)
+    n = matrices.shape[1]
+    with np.errstate(all="ignore"):
+        if length:
+            whole = np.eye(n)
+            for kind in kinds[first : first + length].tolist():
+                whole = matrices[kind] @ whole
+            found = np.linalg.matrix_power(whole, (kinds.size - first) // length)
+            return float(np.nan_to_num(np.abs(found), nan=np.inf).max(initial=0.0))
+        some = kinds[-_STEPS:]
+        start = np.asarray(np.random.default_rng(0).standard_normal(n))
+        free = np.abs(_one_by_one(start, matrices, some, np.zeros((some.size, n))))
+        half = some.size // 2
+        ratio = free[half:].max(initial=0.0) / max(float(free[: half + 1].max(initial=0.0)), 1e-300)
+        return float(ratio ** (kinds.size / max(1, half)))
 
 
 def _pattern(kinds: NDArray[np.intp]) -> tuple[int, int]:
@@ -84,10 +120,6 @@ def _periods(kinds: NDArray[np.intp]) -> list[int]:
     places = np.flatnonzero(same) + 1
     found = kinds.size - 1 - places[:-1][::-1]
     return [int(length) for length in found[:_TRIED] if length * _PATTERN <= kinds.size]
-
-
-_TRIED = 64
-"""Maximum number of lengths of a pattern that are tried."""
 
 
 def _in_pattern(
@@ -115,6 +147,28 @@ def _in_pattern(
             inside[:, j] = now
     found[last:] = _one_by_one(found[last], matrices, kinds[last:], forced[last:])
     return found
+
+
+def _in_blocks(state: Array, matrices: Array, kinds: NDArray[np.intp], forced: Array) -> Array:
+    """States (nsteps, nstates) after each of many different steps, in about sqrt(nsteps) blocks side by side."""
+    nsteps, n = forced.shape
+    per = math.isqrt(nsteps - 1) + 1
+    nblocks = -(-nsteps // per)
+    rest = nblocks * per - nsteps
+    which = np.pad(kinds, (0, rest), mode="edge").reshape(nblocks, per)
+    given = np.pad(forced, ((0, rest), (0, 0))).reshape(nblocks, per, n)
+    products, inner = np.empty((per, nblocks, n, n)), np.empty((per, nblocks, n))
+    products[0], inner[0] = matrices[which[:, 0]], given[:, 0]
+    for j in range(1, per):
+        own = matrices[which[:, j]]
+        np.matmul(own, products[j - 1], out=products[j])
+        inner[j] = np.matmul(own, inner[j - 1, :, :, None])[..., 0] + given[:, j]
+    starts = np.empty((nblocks, n, 1))
+    for k in range(nblocks):
+        starts[k, :, 0] = state
+        state = products[-1, k] @ state + inner[-1, k]
+    found = np.matmul(products, starts)[..., 0] + inner
+    return found.swapaxes(0, 1).reshape(-1, n)[:nsteps]
 
 
 def _one_by_one(state: Array, matrices: Array, kinds: NDArray[np.intp], forced: Array) -> Array:

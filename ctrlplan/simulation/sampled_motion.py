@@ -12,17 +12,20 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.simulation.built_forms import NotApplicableError
+from ctrlplan.simulation.cell_extrema import Cells, joined
 from ctrlplan.simulation.flow_kernel import REACH, FlowKernel, gauss_nodes, to_legendre
 from ctrlplan.simulation.instants import Instants, instants_of
 from ctrlplan.simulation.interpreted import SolverError
-from ctrlplan.simulation.recurrences import marched
+from ctrlplan.simulation.recurrences import growth, marched
 from ctrlplan.simulation.sampled_form import Late, SampledForm
 from ctrlplan.simulation.segments import time_tolerance, values_after
 from ctrlplan.simulation.signals import TimeSignal, signal_values
+from ctrlplan.trajectories.chebyshev import points, transform
 
 _ORDERS = (3, 4, 6, 8, 12, 16)
 """Numbers of Gauss nodes of an interval, until the functions of time are resolved."""
@@ -47,6 +50,9 @@ _TOGETHER = 2**12
 
 _INSTANTS = 5e6
 """Maximum number of sample times of a run, whose states are stored."""
+
+_PIECE = 24
+"""Number of Chebyshev terms of a signal in a part of an interval."""
 
 _NEGLIGIBLE = 1e-18
 """Terms of a series relative to the largest that are left out."""
@@ -112,7 +118,12 @@ class LateSignal:
 
 
 def moved_signals(
-    form: SampledForm, signals: Sequence[TimeSignal], first: float, last: float, state: Array
+    form: SampledForm,
+    signals: Sequence[TimeSignal],
+    first: float,
+    last: float,
+    state: Array,
+    used: NDArray[np.bool_] | None = None,
 ) -> tuple[list[TimeSignal], SampledMotion]:
     """Functions of time of a loop, those of delays in place of given ones, and the motion of the loop.
 
@@ -126,6 +137,8 @@ def moved_signals(
         Start and end of the run [s].
     state : ndarray, shape (nstates,)
         State at the start, before samples.
+    used : ndarray of bool, shape (nw,), optional
+        As for `SampledMotion`.
     """
     z, found, lates = np.concatenate([state, form.registers]), list(signals), list[LateSignal]()
     tolerance = time_tolerance(first, last)
@@ -133,7 +146,7 @@ def moved_signals(
     for late in form.lates:
         lates.append(LateSignal(late, found, z, first, tolerance))
         found[begins.index(late.columns.start)] = lates[-1]
-    motion = SampledMotion(form, found, first, last, z)
+    motion = SampledMotion(form, found, first, last, z, used)
     for signal in lates:
         signal.motion = motion
     return found, motion
@@ -152,6 +165,8 @@ class SampledMotion:
         Start and end of the run [s].
     z : ndarray, shape (nz,)
         States at the start, before samples.
+    used : ndarray of bool, shape (nw,), optional
+        Functions of time that `cells` requires, in addition to the inputs of the flow.
 
     Attributes
     ----------
@@ -163,10 +178,18 @@ class SampledMotion:
         Difference of times that counts as rounding [s].
     """
 
-    def __init__(self, form: SampledForm, signals: Sequence[TimeSignal], first: float, last: float, z: Array) -> None:
+    def __init__(
+        self,
+        form: SampledForm,
+        signals: Sequence[TimeSignal],
+        first: float,
+        last: float,
+        z: Array,
+        used: NDArray[np.bool_] | None = None,
+    ) -> None:
         self.form, self.tolerance = form, time_tolerance(first, last)
         self._signals = signals
-        fed = np.flatnonzero(form.b.any(axis=0))
+        fed = np.flatnonzero(form.b.any(axis=0) if used is None else form.b.any(axis=0) | used)
         self._fed = _Chosen(signals, fed)
         count = sum((last - first) / float(period) for period, _ in form.timings)
         if count > _INSTANTS:
@@ -204,11 +227,8 @@ class SampledMotion:
 
     @property
     def growth(self) -> float:
-        """Growth of a random perturbation of the states over the run, at most."""
-        matrices, kinds = self._steps
-        start = np.random.default_rng(0).standard_normal(matrices.shape[1])
-        free = marched(start, matrices, kinds, np.zeros((kinds.size, start.size)))
-        return float(np.abs(free).max(initial=0.0) / np.abs(start).max(initial=1.0))
+        """Growth of a perturbation of the states over the run, about."""
+        return growth(*self._steps)
 
     def registers_at(self, times: Array) -> Array:
         """States (nz - nstates, ntime) of the registers."""
@@ -233,13 +253,13 @@ class SampledMotion:
             later = np.flatnonzero(own[1:])
             forced[later + 1] += moved[later] @ jump[:, moving].T
         pairs, kinds = np.unique(self._spans.length_of[:-1] * masks.size + due[1:], return_inverse=True)
+        lengths, masks_of = np.divmod(pairs, masks.size)
         matrices = np.empty((pairs.size, z.size, z.size))
-        for k, pair in enumerate(pairs.tolist()):
-            length, mask = divmod(pair, masks.size)
-            flow, n = np.eye(z.size), moving.size
-            flow[np.ix_(moving, moving)] += self._changes[length][:, :n]
-            flow[np.ix_(moving, self._held)] += self._changes[length][:, n : n + self._held.size]
-            matrices[k] = jumps[mask][0] @ flow
+        flows = np.zeros((self._changes.shape[0], moving.size, z.size))
+        flows[:, :, np.concatenate([moving, self._held])] = self._changes[:, :, : moving.size + self._held.size]
+        for k, (jump, _) in enumerate(jumps):
+            own = np.flatnonzero(masks_of == k)
+            matrices[own] = np.matmul(jump[:, moving], flows[lengths[own]]) + jump
         self._steps = matrices, kinds
         found = marched(jumps[due[0]][0] @ z + forced[0], matrices, kinds, forced[1:])
         if not np.isfinite(found).all():
@@ -345,6 +365,65 @@ class SampledMotion:
             found[own] = self._starts[spans] + np.matmul(self._kernel.over(tau), given[..., None])[..., 0]
         return found
 
+    def signal_cells(self, c: Array, d: Array, until: float = np.inf) -> Cells:
+        """Signals c z + d w (nrows) as series in cells of time; d is 0 but for the `used` functions of time.
+
+        Of the intervals that begin before a time.
+        """
+        spans, order, rows = self._spans, self._kernel.order, len(c)
+        parts: list[tuple[Array, Array | float, NDArray[np.intp], Array]] = []
+        direct = d[:, self._fed.columns]
+        lasting = (spans.lengths > self.tolerance) & (spans.starts < until)
+        whole = np.flatnonzero(spans.whole & lasting)
+        pieces = np.flatnonzero(~spans.whole & lasting)
+        if np.count_nonzero(np.bincount(spans.kinds[whole], minlength=1)) > _KINDS:
+            whole, pieces = whole[:0], np.flatnonzero(lasting)
+        held = c.copy()
+        held[:, self.form.moving] = 0.0
+        for kind in np.flatnonzero(np.bincount(spans.kinds[whole], minlength=1)).tolist():
+            own = whole[spans.kinds[whole] == kind]
+            cells, length = self.cells(kind), float(spans.different[kind])
+            for k in range(cells):
+                flow = self.series(own, kind, k) @ c[:, self.form.moving].T
+                count = max(flow.shape[1], order)
+                series = np.zeros((own.size, count, rows))
+                series[:, : flow.shape[1]] = flow
+                if direct.any():
+                    series += self._direct(own, direct, points(count - 1, k / cells, (k + 1) / cells))
+                parts.append((spans.starts[own] + k * length / cells, length / cells, own, series))
+        count = max(_PIECE, order)
+        for own in np.array_split(pieces, 1 + pieces.size // _TOGETHER):
+            fractions = points(count - 1, 0.0, 1.0)
+            which, since = np.repeat(own, count), (spans.lengths[own, None] * fractions).ravel()
+            nodes = (self._by_nodes(which, since) @ c[:, self.form.moving].T).reshape(own.size, count, rows)
+            series = np.einsum("jq,kqr->kjr", transform(np.eye(count)).T, nodes)
+            if direct.any():
+                series += self._direct(own, direct, fractions)
+            parts.append((spans.starts[own], spans.lengths[own], own, series))
+        size = max(series.shape[1] for *_, series in parts)
+        return joined(
+            [
+                _of_series(starts, lengths, self.states[spans.interval[own]] @ held.T, series, size)
+                for starts, lengths, own, series in parts
+            ]
+        )
+
+    def _direct(self, which: NDArray[np.intp], d: Array, fractions: Array) -> Array:
+        """Chebyshev series (nspans, nterms, nrows) of combinations of the functions of time at fractions of spans."""
+        order = self._kernel.order
+        values = self._values[which].reshape(which.size, order, -1) @ d.T
+        table = legendre.legvander(2.0 * fractions - 1.0, order - 1) @ to_legendre(order)
+        return np.einsum("jp,kpr->kjr", transform(np.eye(fractions.size)).T @ table, values)
+
+
+def _of_series(starts: Array, lengths: Array | float, held: Array, series: Array, size: int) -> Cells:
+    """Cells with `size` terms of series (ncells, nterms, nrows) and constants (ncells, nrows)."""
+    found = np.zeros((size, series.shape[2], starts.size))
+    found[: series.shape[1]] = series.transpose(1, 2, 0)
+    found[0] += held.T
+    edge = np.ones(starts.size)
+    return Cells(starts, lengths * edge, found, -edge, edge)
+
 
 class _Chosen:
     """Some of the functions of time of a loop.
@@ -376,7 +455,7 @@ class _Chosen:
     def at(self, times: Array) -> Array:
         """Values (nspans, ntime * ncolumns) at times (nspans, ntime), none of which is a breakpoint."""
         found = signal_values(self.signals, times.ravel())[self._rows]
-        return found.T.reshape(len(times), -1)
+        return found.T.reshape(len(times), times.shape[1] * self.columns.size)
 
     def after(self, times: Array, tolerance: float) -> Array:
         """Values (ncolumns, ntime) after breakpoints that follow within a tolerance."""
@@ -465,10 +544,15 @@ def _orders(spans: _Spans, fed: _Chosen, some: NDArray[np.intp], orders: Sequenc
 
 def _tail(values: Array, order: int) -> float:
     """Last two Legendre coefficients relative to the largest value of each signal, at most."""
-    nodes = values.reshape(len(values), order, -1)
-    last = np.abs(np.einsum("pf,kfm->kpm", to_legendre(order)[-2:], nodes)).max(axis=(0, 1), initial=0.0)
-    size = np.abs(nodes).max(axis=(0, 1), initial=0.0)
+    width = values.shape[1] // order
+    to_last = np.kron(to_legendre(order)[-2:].T, np.eye(width))
+    last, size = (_largest(found).reshape(-1, width).max(axis=0, initial=0.0) for found in (values @ to_last, values))
     return float((last / np.where(size > 0.0, size, 1.0)).max(initial=0.0))
+
+
+def _largest(values: Array) -> Array:
+    """Largest magnitudes of columns."""
+    return np.maximum(values.max(axis=0, initial=0.0), -values.min(axis=0, initial=0.0))
 
 
 def _evaluated(series: Array, row: NDArray[np.intp], x: Array) -> Array:

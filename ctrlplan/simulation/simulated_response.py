@@ -153,8 +153,8 @@ class SimulatedResponse(LoopResponse):
         self.names = (*outputs, *(label for label in prepared.input_labels if label not in outputs))
         self._last = plan.end + (plan.duration if tail is None else tail)
         self.note = f"simulated at tolerance {_RTOL:g}, until {self._last - plan.end:.4g} s after the plan"
-        _check_sources(prepared, plan)
-        self._inputs = _Inputs(plan, fed_signals(prepared.input_labels, plan, prepared.name))
+        check_sources(prepared, plan)
+        self._inputs = LoopInputs(plan, fed_signals(prepared.input_labels, plan, prepared.name))
         self._start = self._at_rest(plan.start, first=True)
 
     def extremes(
@@ -390,7 +390,7 @@ class SimulatedResponse(LoopResponse):
         )
 
 
-class _Inputs(InternalTrajectory):
+class LoopInputs(InternalTrajectory):
     """Inputs of a loop: axes of a plan, their derivatives, and 0."""
 
     what = "inputs of a loop"
@@ -422,7 +422,7 @@ class _Inputs(InternalTrajectory):
         return found
 
 
-def _check_sources(prepared: Prepared, plan: Trajectory) -> None:
+def check_sources(prepared: Prepared, plan: Trajectory) -> None:
     """Raise for a source inside of the loop that is not the plan."""
     for block in () if prepared.network is None else prepared.network.blocks:
         source = block.plan
