@@ -15,13 +15,14 @@ from scipy.optimize import brentq
 from ctrlplan._checks import checked_finite, checked_pair
 from ctrlplan._display import Displayed, Facts, Figure, Part
 from ctrlplan._renamed import FormerAttribute
+from ctrlplan.planning.durations import PlansByDuration, ReplannedPlans
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
 from ctrlplan.planning.path_law import fastest_law
 from ctrlplan.planning.quantities import System, shapes_given, system_given
-from ctrlplan.planning.scalar_search import bisected, scan
+from ctrlplan.planning.scalar_search import bisected, bottom, scan
 from ctrlplan.planning.time_law import with_fast_time_law
-from ctrlplan.trajectories import PathPlan, Retimed, Trajectory, WaypointSpline
+from ctrlplan.trajectories import PathPlan, Retimed, Trajectory
 from ctrlplan.trajectories.common import Array
 
 if TYPE_CHECKING:
@@ -37,6 +38,15 @@ _DOUBLINGS_IN_LOOP = 6
 
 _EDGE = 1e-7
 """Resolution of a minimum duration by simulated responses, relative to the duration."""
+
+_FALLS = 0.99
+"""Ratio of the violations of durations that differ by an octave below which a longer one may be feasible."""
+
+_STEPS = 5
+"""Maximum number of steps to the boundary of the feasible durations."""
+
+_NEAR = 1e-8
+"""Change of a duration, relative to it, whose square is below rounding."""
 
 _ROUNDING = 1e-14
 """The same by exact responses."""
@@ -186,7 +196,7 @@ def fastest(
     durations : (float, float), optional
         Interval of durations [s] of the search. Default: from 1/64 of the minimum
         that was found (of the plan's duration for "waypoints") to 64 times the
-        plan's duration.
+        plan's duration, and to longer ones while the violation falls.
     tail : float, optional
         Time after the plan [s] for which a loop is simulated, as for `margins`.
     resolution : float, optional
@@ -306,13 +316,12 @@ def fastest_under(
     """Plan of minimum duration, for precomputed limits; arguments as for `fastest`."""
     if hold != "path":
         limited.check_smooth(plan)
-    extrema = plan.extrema()
-    if not (extrema.maximum - extrema.minimum > 1e-14 * plan.peak()).any():
+    if not _moves(plan):
         raise ValueError(f"plan must move, got constant axes: {plan!r}")
     if limited.loop_bounds:
         return _fastest_in_loop(plan, limited, hold, span, resolution)
     if hold == "waypoints":
-        return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold, endless=False)
+        return _searched(ReplannedPlans(plan, limited), span, hold, endless=False)
     if hold == "path":
         limited.check_constant('limits with hold="path"')
         if isinstance(plan, PathPlan):
@@ -347,6 +356,15 @@ def _fastest_between_stops(plan: PathPlan, limited: Limited, span: tuple[float, 
     return replace(found, hold="path")
 
 
+def _moves(plan: Trajectory) -> bool:
+    """Whether a position changes by more than rounding: at breakpoints, otherwise over the whole plan."""
+    positions = np.concatenate([plan(plan.breakpoints), plan(0.5 * (plan.breakpoints[1:] + plan.breakpoints[:-1]))], -1)
+    if (np.ptp(positions, axis=-1) > 1e-12 * np.abs(positions).max(axis=-1)).any():
+        return True
+    extrema = plan.extrema()
+    return bool((extrema.maximum - extrema.minimum > 1e-14 * plan.peak()).any())
+
+
 def _fastest_in_loop(
     plan: Trajectory, limited: Limited, hold: Hold, span: tuple[float, float] | None, resolution: float
 ) -> Fastest:
@@ -358,14 +376,14 @@ def _fastest_in_loop(
     limited.check_ends(plan)
     shapes = shapes_given(limited.loop)
     if shapes is None or hold == "waypoints" or not bounds_of_values(limited):
-        family = _InLoop(_Scaled(plan, limited) if hold == "shape" else _Replanned(plan, limited))
+        family = _InLoop(PlansByDuration(plan, limited) if hold == "shape" else ReplannedPlans(plan, limited))
         return _first_feasible(family, span or _span(family, plan.duration, minimum), hold)
     problem = LoopProblem(plan, limited, shapes, resolution)
     shortest, searched = problem.shortest(span, minimum)
-    found = _satisfying(limited, plan.retime, shortest)
+    found, margins = _satisfying(limited, plan.retime, shortest)
     feasible = ((found.duration, found.duration),)
     statement = problem.statement(*searched, minimum)
-    return Fastest(found, limited.margins(found), feasible, "shape", limited, "", searched, statement)
+    return Fastest(found, margins, feasible, "shape", limited, "", searched, statement)
 
 
 def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, float] | None) -> Fastest:
@@ -383,10 +401,10 @@ def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, floa
             f"limits must be satisfied for some duration from {span[0]:.4g} to {span[1]:.4g} s, got a minimum of "
             f"{shortest:.6g} s"
         )
-    found = _satisfying(limited, found.retime, shortest)
+    found, margins = _satisfying(limited, found.retime, shortest)
     searched = span or (0.0, math.inf)
     feasible = ((found.duration, searched[1]),)
-    return Fastest(found, limited.margins(found), feasible, "path", limited, searched=searched, stops=law.stops)
+    return Fastest(found, margins, feasible, "path", limited, searched=searched, stops=law.stops)
 
 
 def _check_open(plan: Trajectory) -> None:
@@ -404,62 +422,18 @@ def _check_open(plan: Trajectory) -> None:
         )
 
 
-class _Scaled:
-    """Plans of fixed shape as a function of duration: jets are scaled by powers."""
-
-    per_octave = 24
-
-    def __init__(self, plan: Trajectory, limited: Limited) -> None:
-        self._plan, self.limited = plan, limited
-        self._samples = limited.sampled(plan)
-
-    def plan(self, duration: float) -> Trajectory:
-        return self._plan.retime(duration)
-
-    def excess(self, duration: float) -> float:
-        return self.limited.excess(self._samples.retimed(duration))
-
-
-class _Replanned:
-    """Plans with fixed derivatives at the waypoints as a function of duration."""
-
-    per_octave = 24
-
-    def __init__(self, plan: Trajectory, limited: Limited) -> None:
-        self._plan: Trajectory = plan.quiet() if isinstance(plan, WaypointSpline) else plan
-        self.limited = limited
-
-    def plan(self, duration: float) -> Trajectory:
-        return replanned(self._plan, duration)
-
-    def excess(self, duration: float) -> float:
-        return self.limited.excess(self.limited.sampled(self.plan(duration)))
-
-
-def replanned(plan: Trajectory, duration: float) -> Trajectory:
-    """Plan of another duration with the derivatives of the waypoints preserved."""
-    if not isinstance(plan, WaypointSpline):
-        raise TypeError(
-            f'plan must be a WaypointSpline, such as PolySpline, for hold="waypoints", got a {type(plan).__name__}; '
-            'use hold="shape" or "path"'
-        )
-    retimed = plan.retime(duration)
-    pairs = zip(plan.waypoints, retimed.waypoints, strict=True)
-    return retimed.through(given.scaled(moved.time, 1.0) for given, moved in pairs)
-
-
 def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float] | None = None) -> Fastest:
     """Plan of minimum duration with fixed shape, for precomputed limits."""
-    scaled = _Scaled(plan, limited)
+    scaled = PlansByDuration(plan, limited)
     _check_rest(plan, limited)
     minimum = _closed_form(plan, limited)
     if limited.derivatives_only and limited.is_constant and span is None:
         if not minimum:
             raise ValueError("limits must include one that a shorter plan would violate, got none")
-        found = _satisfying(limited, plan.retime, minimum)
-        return Fastest(found, limited.margins(found), ((found.duration, math.inf),), "shape", limited)
+        found, margins = _satisfying(limited, plan.retime, minimum * (1.0 + 2.0 * np.finfo(float).eps))
+        return Fastest(found, margins, ((found.duration, math.inf),), "shape", limited)
     if limited.may_end:
-        return _searched(scaled, span or _around(plan.duration), "shape", endless=False)
+        return _searched(scaled, span, "shape", endless=False)
     return _searched(scaled, span or _span(scaled, plan.duration, minimum), "shape", endless=True)
 
 
@@ -468,9 +442,13 @@ class _InLoop:
 
     per_octave = 12
 
-    def __init__(self, family: _Scaled | _Replanned) -> None:
+    def __init__(self, family: PlansByDuration) -> None:
         self.plan, self.limited, self._own = family.plan, family.limited, family.excess
         self.excess = cache(self._excess)
+
+    def exact_excess(self, duration: float) -> float:
+        """Maximum excess over the whole plan."""
+        return self.limited.exact_excess(self.plan(duration))
 
     def _excess(self, duration: float) -> float:
         own = self._own(duration)
@@ -560,11 +538,11 @@ def _around(duration: float) -> tuple[float, float]:
     return duration / 64.0, 64.0 * duration
 
 
-def _span(scaled: _Scaled | _InLoop, duration: float, minimum: float) -> tuple[float, float]:
+def _span(scaled: PlansByDuration | _InLoop, duration: float, minimum: float) -> tuple[float, float]:
     """Interval of durations of the search, from violated to satisfied limits."""
     excess, high = scaled.excess, max(duration, minimum)
     for _ in range(_DOUBLINGS_IN_LOOP if isinstance(scaled, _InLoop) else 60):
-        if excess(high) <= 0.0 and scaled.limited.exact_excess(scaled.plan(1.01 * high)) <= 0.0:
+        if excess(high) <= 0.0 and scaled.exact_excess(1.01 * high) <= 0.0:
             break
         high *= 2.0
     else:
@@ -582,23 +560,19 @@ def _span(scaled: _Scaled | _InLoop, duration: float, minimum: float) -> tuple[f
     return max(low, 0.999 * minimum), 1.01 * high
 
 
-def _searched(family: _Scaled | _Replanned | _InLoop, span: tuple[float, float], hold: Hold, endless: bool) -> Fastest:
+def _searched(family: PlansByDuration, span: tuple[float, float] | None, hold: Hold, endless: bool) -> Fastest:
     """Plan of minimum duration, and all feasible durations; `endless` if every slower plan is feasible."""
     limited = family.limited
-    exact = cache(lambda duration: limited.exact_excess(family.plan(duration)))
-    count = max(9, math.ceil(family.per_octave * math.log2(span[1] / span[0])))
-    durations, excess = scan(family.excess, np.geomspace(*span, count), 0.0)
+    durations, excess = _scanned(family, span)
     feasible = []
     for low, high in _runs(excess <= 0.0):
-        inside = low + np.argsort(excess[low : high + 1])[:8]
-        # Samples may miss the extrema.
-        middle = next((d for d in durations[inside].tolist() if exact(d) <= 0.0), None)
+        middle = _feasible_inside(family, durations, excess, low, high)
         if middle is None:
             continue
         ends = [
             float(durations[inner])
             if not 0 <= outer < durations.size
-            else _feasible_edge(exact, family.excess, middle, float(durations[outer]))
+            else _edge(family, middle, float(durations[inner]), float(durations[outer]))
             for inner, outer in ((low, low - 1), (high, high + 1))
         ]
         feasible.append((ends[0], ends[1]))
@@ -606,11 +580,10 @@ def _searched(family: _Scaled | _Replanned | _InLoop, span: tuple[float, float],
         _reject(family, durations, excess)
     if endless and feasible[-1][1] == durations[-1]:
         feasible[-1] = (feasible[-1][0], math.inf)
-    plan = _satisfying(limited, family.plan, feasible[0][0])
-    found = limited.margins(plan)
+    plan, found = _satisfying(limited, family.plan, feasible[0][0])
     # If no limit is active, shorter plans are infeasible for the plant.
     rejection = limited.rejection(family.plan(0.99 * plan.duration)) if found.active.fraction > 1e-6 else ""
-    searched = (span[0], math.inf if math.isinf(feasible[-1][1]) else span[1])
+    searched = (float(durations[0]), math.inf if math.isinf(feasible[-1][1]) else float(durations[-1]))
     return Fastest(plan, found, tuple(feasible), hold, limited, rejection, searched)
 
 
@@ -618,6 +591,87 @@ def _runs(inside: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """First and last index of every run of true."""
     change = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]])))
     return [(int(a), int(b) - 1) for a, b in change.reshape(-1, 2)]
+
+
+def _scanned(family: PlansByDuration, span: tuple[float, float] | None) -> tuple[Array, Array]:
+    """Durations of a search, increasing, and their excess; without a span the search goes on while the excess falls."""
+    low, high = span or _around(family.given.duration)
+    durations, excess = _scan(family, low, high)
+    while span is None and excess.min() > 0.0 and excess[-1] < _FALLS * family.excess(0.5 * high):
+        low, high = high, 64.0 * high
+        more, values = _scan(family, low, high)
+        durations, excess = np.append(durations, more[1:]), np.append(excess, values[1:])
+    return durations, excess
+
+
+def _scan(family: PlansByDuration, low: float, high: float) -> tuple[Array, Array]:
+    """Durations in an interval, increasing, and their excess."""
+    grid = np.geomspace(low, high, max(9, math.ceil(family.per_octave * math.log2(high / low))))
+    return scan(family.excess, grid, 0.0, values=family.excesses(grid))
+
+
+def _feasible_inside(family: PlansByDuration, durations: Array, excess: Array, low: int, high: int) -> float | None:
+    """Feasible duration among those that are feasible at samples, which may miss extrema."""
+    inside = durations[low + np.argsort(excess[low : high + 1])[:8]].tolist()
+    known = [duration for duration in (durations[low], durations[high]) if family.is_known(float(duration))]
+    for duration in [*known, *inside]:
+        if family.exact_excess(float(duration)) <= 0.0:
+            return float(duration)
+    lowest = low + int(excess[low : high + 1].argmin())
+    duration, _ = bottom(family.excess, durations, lowest, 1e-7)
+    return duration if family.exact_excess(duration) <= 0.0 else None
+
+
+def _edge(family: PlansByDuration, middle: float, inside: float, outside: float) -> float:
+    """Boundary of the feasible durations near one that is feasible at samples, before an infeasible one.
+
+    At the time of the active extremum the excess is a function of the duration
+    alone. Its root differs from the boundary by the square of the distance from
+    the duration at which that time was found.
+    """
+    edge = _sampled_root(family, inside, outside)
+    for _ in range(_STEPS if edge is not None else 0):
+        root = None if edge is None else _root_at_extremum(family, edge)
+        if root is None or edge is None or not min(inside, outside) <= root <= max(inside, outside):
+            break
+        if abs(root - edge) <= _NEAR * edge:
+            return root
+        edge = root
+    return _feasible_edge(family.exact_excess, family.excess, middle, outside)
+
+
+def _sampled_root(family: PlansByDuration, inside: float, outside: float) -> float | None:
+    """Duration at which the excess at samples vanishes; None if it jumps."""
+    wall = 1e3
+
+    def excess(duration: float) -> float:
+        return min(family.excess(duration), wall)
+
+    if not (excess(inside) < 0.0 < excess(outside)):
+        return None
+    root = float(brentq(excess, inside, outside, xtol=1e-9 * inside, rtol=1e-9))
+    return root if abs(family.excess(root)) < 1e-6 else None
+
+
+def _root_at_extremum(family: PlansByDuration, duration: float) -> float | None:
+    """Duration at which the excess vanishes at the time of the active extremum; None if there is none."""
+    margins = family.margins(duration)
+    if margins is None:
+        return None
+    bounds, row = family.limited.bounds, margins.active
+    chosen = [k for k, bound in enumerate(bounds) if bound == row.bound and bound.is_constant and bound.kind == "value"]
+    excess = family.excess_at(chosen[0], (row.time - family.given.start) / duration) if chosen else None
+    if excess is None:
+        return None
+    width = 1e-7
+    while width < 1e-2:
+        low, high = duration * (1.0 - width), duration * (1.0 + width)
+        if (excess(low) > 0.0) != (excess(high) > 0.0):
+            if not (math.isfinite(excess(low)) and math.isfinite(excess(high))):
+                return None
+            return float(brentq(excess, low, high, xtol=1e-15 * duration, rtol=4.0 * np.finfo(float).eps))
+        width *= 8.0
+    return None
 
 
 def _feasible_edge(
@@ -646,18 +700,24 @@ def _feasible_edge(
     return float(brentq(exact, good, bad, xtol=1e-14 * good, rtol=1e-14)) if exact(bad) > 0.0 else bad
 
 
-def _satisfying(limited: Limited, plan_of: Callable[[float], Trajectory], duration: float) -> Trajectory:
-    """Plan of a duration, which is increased by roundings until the limits are satisfied."""
+def _satisfying(
+    limited: Limited, plan_of: Callable[[float], Trajectory], duration: float
+) -> tuple[Trajectory, Margins]:
+    """Plan of a duration, which is increased by roundings until the limits are satisfied, and its margins."""
     step = float(np.spacing(duration))
     while step < 1e-6 * duration:
         plan = plan_of(duration)
-        if limited.exact_excess(plan) <= 0.0:
-            return plan
+        try:
+            margins = limited.margins(plan)
+        except ValueError:
+            margins = None
+        if margins is not None and margins.satisfied:
+            return plan, margins
         duration, step = duration + step, 2.0 * step
     raise ValueError(f"limits must be satisfied near {duration:.6g} s, got {limited.margins(plan).active}")
 
 
-def _reject(family: _Scaled | _Replanned | _InLoop, durations: Array, excess: Array) -> NoReturn:
+def _reject(family: PlansByDuration | _InLoop, durations: Array, excess: Array) -> NoReturn:
     span = f"from {durations[0]:.4g} to {durations[-1]:.4g} s"
     if math.isinf(excess.min()):
         if family.limited.loop_bounds:

@@ -443,15 +443,57 @@ class Limited:
 
     def excess(self, samples: Sampled) -> float:
         """Maximum excess over samples, without limits of a loop; inf if the plan is infeasible for the plant."""
-        if not self._local:
-            return -math.inf
+        return float(self.excesses_of(samples.jet[:, :, None], samples, np.array([samples.duration]))[0])
+
+    def excesses_of(
+        self, jets: Array, samples: Sampled, durations: Array, chosen: Sequence[int] | None = None
+    ) -> Array:
+        """As `excess`, for several durations.
+
+        Parameters
+        ----------
+        jets : ndarray, shape (order + 1, naxes, ndurations, ntime)
+            Jets at the samples.
+        samples : Sampled
+            Relative times and weights of the samples.
+        durations : ndarray, shape (ndurations,)
+            Durations [s].
+        chosen : sequence of int, optional
+            Numbers of the limits; default all but those of a loop.
+
+        Returns
+        -------
+        ndarray, shape (ndurations,)
+        """
+        chosen = self._local if chosen is None else chosen
+        if not chosen:
+            return np.full(durations.size, -np.inf)
+        # Rates of quantities use a step that depends on all samples of one plan.
+        together = durations.size == 1 or all(self.bounds[k].kind != "rate" or self.derivatives_only for k in chosen)
         try:
-            values = self.values(samples.jet)
-        except ValueError:  # infeasible for the plant, such as a rope under compression
-            return math.inf
+            if not together:
+                raise ValueError("one duration after the other")
+            values = self.values(jets.reshape(*jets.shape[:2], -1)).reshape(len(self.bounds), *jets.shape[2:])
+        except ValueError:  # infeasible for the plant at one of the durations, such as a rope under compression
+            if durations.size == 1:
+                return np.full(1, math.inf)
+            half = durations.size // 2
+            parts = ((jets[:, :, k], durations[k]) for k in (slice(0, half), slice(half, None)))
+            return np.concatenate([self.excesses_of(part, samples, own, chosen) for part, own in parts])
         times = self._start + self._duration * samples.fractions
-        worst = max(self._excess_of(self.bounds[k], values[k], times, samples) for k in self._local)
-        return math.inf if math.isnan(worst) else worst
+        found = [
+            [
+                self._excess_of(
+                    self.bounds[k], values[k, n], times, replace(samples, jet=jets[:, :, n], duration=duration)
+                )
+                for n, duration in enumerate(durations.tolist())
+            ]
+            if self.bounds[k].kind == "rms"
+            else self.bounds[k].excess(values[k], times).max(axis=1)
+            for k in chosen
+        ]
+        worst = np.max(found, axis=0)
+        return np.where(np.isnan(worst), math.inf, worst)
 
     def _excess_of(self, bound: Bound, row: Array, times: Array, samples: Sampled) -> float:
         if bound.kind != "rms":
@@ -655,12 +697,14 @@ class Limited:
         """
         plan = self.seen(plan)
         moving = {t for t in (plan.start, plan.end) if plan.jet(t, 1, left=t > plan.start)[1].any()}
+        highest = max((self.bounds[k].order for k in self._local), default=0)
+        jumps = plan.jumps(highest - 1) if highest else ()
         for k in self._local:
             bound = self.bounds[k]
             axes = {plan.labels[signal.axis] for signal, _ in bound.terms if signal.axis is not None}
             first, last = (-math.inf, math.inf) if bound.interval is None else self._interval(bound, plan)
-            for jump in plan.jumps(bound.order - 1) if bound.order else ():
-                inside = jump.time not in moving and first <= jump.time <= last
+            for jump in jumps:
+                inside = jump.order < bound.order and jump.time not in moving and first <= jump.time <= last
                 if inside and (len(axes) < len(bound.terms) or jump.label in axes):
                     what = "position" if jump.order == 0 else derivative_name(jump.label, jump.order)
                     raise ValueError(
@@ -688,7 +732,9 @@ class Limited:
                 )
 
     def at_rest(self, plan: Trajectory) -> Sampled:
-        """Samples of the plan with zero derivatives."""
+        """Samples of the plan with zero derivatives; one sample if no limit depends on position or time."""
+        if self.is_constant and all(b.axis is not None and b.order for b in self.bounds):
+            return Sampled(np.zeros((self.order + 1, plan.naxes, 1)), np.zeros(1), np.ones(1), plan.duration)
         samples = self.sampled(plan)
         return replace(samples, jet=samples.jet * (np.arange(self.order + 1) == 0)[:, None, None])
 
@@ -747,7 +793,8 @@ class Limited:
                 yield replace(bound, slack=1e-12 if 0.0 in (bound.low, bound.high) else 0.0)
             return
         try:
-            self.values(self.sampled(plan).jet)
+            if not self.derivatives_only:
+                self.values(self.sampled(plan).jet)
         except UndeterminedError:  # as at any other duration
             raise
         except ValueError:  # infeasible for the plant, but possibly feasible more slowly

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from ctrlplan.planning.fastest import Fastest, Hold, fastest_under, replanned
+from ctrlplan.planning.durations import replanned
+from ctrlplan.planning.fastest import Fastest, Hold, fastest_under
 from ctrlplan.planning.limits import Limited, Margins
 from ctrlplan.planning.parameters import Family, Point, margins_over
 from ctrlplan.trajectories import Trajectory

@@ -12,7 +12,11 @@ from ctrlplan.trajectories.common import Array
 
 
 def scan(
-    function: Callable[[float], float], grid: Array, target: float | None = None, rtol: float = 1e-7
+    function: Callable[[float], float],
+    grid: Array,
+    target: float | None = None,
+    rtol: float = 1e-7,
+    values: Array | None = None,
 ) -> tuple[Array, Array]:
     """Samples of a function that include its relevant local minima.
 
@@ -23,23 +27,27 @@ def scan(
     grid : ndarray, shape (npoints,)
         Initial points, increasing; as fine as the features of the function.
     target : float, optional
-        Local minima that cannot be below it are not refined; default: the minimum
-        on the grid.
+        Local minima that cannot be below it are not refined, nor are those whose
+        grid point is below it; default: the minimum on the grid is refined.
     rtol : float, optional
         Tolerance of the places of local minima, relative to them.
+    values : ndarray, shape (npoints,), optional
+        Values on the grid, if they are known.
 
     Returns
     -------
     (ndarray, ndarray)
         Points, increasing, and values.
     """
-    values = np.array([function(x) for x in grid.tolist()])
+    if values is None:
+        values = np.array([function(x) for x in grid.tolist()])
     finite = values[np.isfinite(values)]
     # Between a value and inf the search compares finite numbers.
     wall = float(finite.max() + np.ptp(finite) + 1.0) if finite.size else math.inf
     found = [
-        _bottom(lambda x: min(function(x), wall), grid, k, rtol)
+        bottom(lambda x: min(function(x), wall), grid, k, rtol)
         for k in _valleys(values, values.min() if target is None else target)
+        if target is None or values[k] > target
     ]
     found = [(x, v) for x, v in found if v < wall]
     points = np.concatenate([grid, [x for x, _ in found]])
@@ -72,6 +80,13 @@ def bisected(
     return inside, outside
 
 
+def bottom(function: Callable[[float], float], grid: Array, k: int, rtol: float) -> tuple[float, float]:
+    """Minimum between the neighbours of a grid point, and its place first."""
+    low, high = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, grid.size - 1)])
+    found = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": rtol * (high + low)})
+    return float(found.x), float(found.fun)
+
+
 def _valleys(values: Array, target: float) -> list[int]:
     """Grid points below both neighbours, near which the target can be reached."""
     padded = np.concatenate([[math.inf], values, [math.inf]])
@@ -81,10 +96,3 @@ def _valleys(values: Array, target: float) -> list[int]:
     with np.errstate(invalid="ignore"):
         rise = np.where(np.isfinite(left), left, here) + np.where(np.isfinite(right), right, here) - 2.0 * here
         return np.flatnonzero(low & ~(here - 1.25 * rise > target)).tolist()
-
-
-def _bottom(function: Callable[[float], float], grid: Array, k: int, rtol: float) -> tuple[float, float]:
-    """Minimum between the neighbours of a grid point."""
-    low, high = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, grid.size - 1)])
-    found = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": rtol * (high + low)})
-    return float(found.x), float(found.fun)

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from ctrlplan.trajectories.common import Array
@@ -57,13 +56,26 @@ def fit(function: Callable[[Array], Array], interval: tuple[float, float], degre
 
 def real_roots(coefficients: Array) -> Array:
     """Roots of a Chebyshev series in [-1, 1], including double roots split by rounding."""
+    return np.sort(roots_of_rows(coefficients[None])[1])
+
+
+def roots_of_rows(coefficients: Array) -> tuple[NDArray[np.intp], Array]:
+    """Rows and roots in [-1, 1] of Chebyshev series (nrows, size), including double roots split by rounding."""
     size = np.abs(coefficients)
-    matters = np.flatnonzero(size > 1e-15 * size.max()) if size.max() > 0 else np.array([], dtype=int)
-    if not matters.size or matters[-1] == 0:
-        return np.empty(0)
-    roots: NDArray[np.complex128] = np.asarray(chebyshev.chebroots(coefficients[: matters[-1] + 1]), dtype=complex)
-    near = (np.abs(roots.imag) < 1e-3) & (np.abs(roots.real) < 1.0 + 1e-6)
-    return np.clip(np.sort(roots.real[near]), -1.0, 1.0)
+    matters = size > 1e-15 * size.max(axis=1, keepdims=True)
+    degree = np.where(matters.any(axis=1), size.shape[1] - 1 - matters[:, ::-1].argmax(axis=1), 0)
+    rows, roots = [np.empty(0, dtype=np.intp)], [np.empty(0)]
+    for n in np.unique(degree[degree > 0]).tolist():
+        own = np.flatnonzero(degree == n)
+        # Eigenvalues of the colleague matrices, whose last columns differ.
+        matrices = np.repeat(_colleague(n)[None], own.size, axis=0)
+        weights = np.where(np.arange(n) > 0, 1.0, np.sqrt(2.0)) if n > 1 else np.ones(1)
+        matrices[:, :, -1] -= (0.5 if n > 1 else 1.0) * weights * coefficients[own, :n] / coefficients[own, n, None]
+        found: NDArray[np.complex128] = np.linalg.eigvals(matrices).astype(complex)
+        near = (np.abs(found.imag) < 1e-3) & (np.abs(found.real) < 1.0 + 1e-6)
+        rows.append(own[np.nonzero(near)[0]])
+        roots.append(np.clip(found.real[near], -1.0, 1.0))
+    return np.concatenate(rows), np.concatenate(roots)
 
 
 def points(degree: int, a: float, b: float) -> Array:
@@ -74,6 +86,14 @@ def points(degree: int, a: float, b: float) -> Array:
 def transform(values: Array) -> Array:
     """Coefficients (..., size) of the interpolant of values (..., size) at `points`."""
     return values @ _matrix(values.shape[-1] - 1)
+
+
+@lru_cache(maxsize=64)
+def _colleague(degree: int) -> Array:
+    """Symmetric colleague matrix of the Chebyshev polynomial of a degree."""
+    beside = np.full(degree - 1, 0.5)
+    beside[:1] = np.sqrt(0.5)
+    return np.diag(beside, 1) + np.diag(beside, -1)
 
 
 @lru_cache(maxsize=16)

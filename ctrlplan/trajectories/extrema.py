@@ -14,7 +14,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.trajectories.batches import inner_extrema
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, points, real_roots, transform
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, points, real_roots, roots_of_rows, transform
 from ctrlplan.trajectories.common import Array, readonly
 
 if TYPE_CHECKING:
@@ -24,9 +24,6 @@ TOLERANCE = 1e-9
 """Error of an extremum of a function of the jet, relative to the function's largest magnitude."""
 
 _SAMPLES = 8192  # minimum number of times at which such a function is evaluated
-
-_TOGETHER = 16
-"""Number of segments that are searched before bounds are compared again."""
 
 _MAX_PIECES = 20_000
 _CHUNK = 256  # pieces that are evaluated together
@@ -114,47 +111,42 @@ def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     if plan.in_batches:
         _search_together(plan, nu, found)
         return found.extrema()
-    bounds = plan.derivative_bounds(nu)
-    if bounds is None:
+    places = plan.stationary_places(nu)
+    if places is None:
         for segment in range(plan.breakpoints.size - 1):
             _search(plan, nu, segment, found)
     else:
-        _search_bounded(plan, nu, *bounds, found)
+        _search_places(plan, nu, *places, found)
     return found.extrema()
 
 
-def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> Array:
-    """Add the candidates of a segment; return their values."""
+def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None:
+    """Add the candidates of a segment."""
 
     def jet(t: Array, order: int) -> Array:
         return plan.segment_jet(segment, t, order)
 
     t = stationary_times(jet, float(plan.breakpoints[segment + 1] - plan.breakpoints[segment]), nu)
     times, ends = _placed(plan, segment, t)
-    values = jet(t, nu)[nu]
-    found.add(times, values, ends)
-    return values
+    found.add(times, jet(t, nu)[nu], ends)
 
 
-def _search_bounded(plan: Trajectory, nu: int, low: Array, high: Array, found: _Candidates) -> None:
-    """Add candidates of the segments whose bounds (naxes, nsegments) exceed the extrema found so far."""
-    breakpoints = plan.breakpoints
-    sides = [plan.jet(breakpoints[:-1], nu)[nu], plan.jet(breakpoints[1:], nu, left=True)[nu]]
-    found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), np.concatenate(sides, axis=1))
-    least, largest = np.concatenate(sides, axis=1).min(axis=1), np.concatenate(sides, axis=1).max(axis=1)
-    waiting = np.ones(breakpoints.size - 1, dtype=bool)
-    while True:
-        size = np.maximum(np.maximum(np.abs(least), np.abs(largest)), _TINY)[:, None]
-        with np.errstate(over="ignore"):
-            beyond = np.maximum(high - largest[:, None], least[:, None] - low) / size
-        excess = beyond.max(axis=0)
-        rest = np.flatnonzero(waiting & (excess >= -2.0 * _ROUNDING))  # ties as well, of which the earliest counts
-        if not rest.size:
+def _search_places(plan: Trajectory, nu: int, segments: NDArray[np.intp], s: Array, found: _Candidates) -> None:
+    """Add the ends of all segments, and candidates at times from the beginning of segments."""
+    breakpoints, durations = plan.breakpoints, np.diff(plan.breakpoints)
+    every, lengths = np.tile(np.arange(durations.size), 2), np.append(np.zeros(durations.size), durations)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), plan.segments_jet(every, lengths, nu)[nu])
+        if not s.size:
             return
-        for segment in rest[np.argsort(-excess[rest], kind="stable")[:_TOGETHER]].tolist():
-            values = _search(plan, nu, segment, found)
-            least, largest = np.minimum(least, values.min(axis=1)), np.maximum(largest, values.max(axis=1))
-            waiting[segment] = False
+        slope, curve = plan.segments_jet(segments, s, nu + 2)[nu + 1 :]
+        moved = s - slope / curve  # as `_polished`
+    duration = durations[segments]
+    near = np.isfinite(moved) & (np.abs(moved - s) < 1e-6 * duration) & (moved >= 0.0) & (moved <= duration)
+    segments = np.concatenate([segments, *(segments[row] for row in near)])
+    s = np.concatenate([s, moved[near]])
+    starts, ends = breakpoints[segments], breakpoints[segments + 1]
+    found.add(np.clip(starts + s, starts, np.nextafter(ends, starts)), plan.segments_jet(segments, s, nu)[nu])
 
 
 def _search_together(plan: Trajectory, nu: int, found: _Candidates) -> None:
@@ -187,7 +179,7 @@ def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: in
     """
     times = [np.array([0.0, duration])]
     for left, right, slopes in _pieces(jet, 0.0, duration, nu + 1):
-        times += [0.5 * (left + right) + 0.5 * (right - left) * real_roots(series) for series in slopes]
+        times.append(0.5 * (left + right) + 0.5 * (right - left) * roots_of_rows(slopes)[1])
     t = np.concatenate(times)
     t = np.concatenate([t, _polished(jet, t, nu, duration)])
     # Candidates within rounding of an end are that end.
@@ -320,7 +312,7 @@ class _Search:
         for piece in np.flatnonzero(matters.any(axis=0) & ~split).tolist():
             t = [times[piece, _FIT + 1 : _FIT + 3]]
             for row in np.flatnonzero(matters[:, piece]).tolist():
-                roots = real_roots(chebyshev.chebder(series[row, piece])) if smooth[row, piece] else 2.0 * own - 1.0
+                roots = real_roots(_slope(series[row, piece])) if smooth[row, piece] else 2.0 * own - 1.0
                 t.append(np.minimum(width * (index[piece] + 0.5 * (1.0 + roots)), duration))
             self._add(segment, np.concatenate(t))
         return index[split], float(rest[:, split].max(initial=0.0))
@@ -434,6 +426,12 @@ def _evaluated(function: Callable[[Array], Array], jet: Array) -> Array:
     if not np.isfinite(values).all():
         raise ValueError("function must be finite over the plan, got nan or inf")
     return values
+
+
+def _slope(series: Array) -> Array:
+    """Derivative of a Chebyshev series without the terms that are rounding, which would only slow down its roots."""
+    size = np.abs(series) * np.arange(series.size) ** 2
+    return np.asarray(chebyshev.chebder(series[: int(np.flatnonzero(size >= 1e-12 * size.max()).max(initial=1)) + 1]))
 
 
 _SHARES = readonly(np.append(points(_FIT, 0.0, 1.0), [0.0, 1.0]))

@@ -53,6 +53,8 @@ class NewtonSpline(WaypointSpline):
         Shape parameter [rad], the angle of the plan on the circle; 0 is the polynomial.
     """
 
+    is_linear = True
+
     alpha: float
     _options: SplineOptions
     _times: list[float]

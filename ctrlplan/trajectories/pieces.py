@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Value
-from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers, derivative_scale, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale, readonly
 from ctrlplan.trajectories.conjugate import SHORT, Kind, segment_system
 from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
@@ -100,17 +100,6 @@ class Pieces(Fields):
         run = self.runs[0] if len(self.runs) == 1 else self.run(segment)
         return run.system.series_at(run.coefficients[:, :, segment - run.first].T.tolist(), u, order)
 
-    def derivative_bounds(self, nu: int) -> tuple[Array, Array]:
-        """Bounds (naxes, nsegments) of the nu-th derivative of polynomials by relative time."""
-        bounds = []
-        for run in self.runs:
-            matrix = _bernstein(run.system, nu)
-            values = np.tensordot(matrix, run.coefficients, 1)
-            rounding = 8.0 * np.finfo(float).eps * np.tensordot(np.abs(matrix), np.abs(run.coefficients), 1).max(axis=0)
-            bounds.append((values.min(axis=0) - rounding, values.max(axis=0) + rounding))
-        low, high = (np.concatenate(rows, axis=1) for rows in zip(*bounds, strict=True))
-        return low, high
-
     def at(self, segment: int, u: Value, order: int) -> list[list[Value]]:
         """Taylor series by axis at one relative time, a number or a symbol."""
         system, coefficients = self.of_segment(segment)
@@ -179,17 +168,6 @@ def _carefully_solved(system: NewtonSystem, kind: Kind, table: Array, data: Arra
         values, moments = table[k + system.waypoint_index, system.order_index], times[k : k + 2].tolist()
         found.append(system.fitted(values, moments, moments[1] - moments[0], data[:, :, k - kind.first]))
     return np.stack(found, axis=2)
-
-
-def _bernstein(system: NewtonSystem, nu: int) -> Array:
-    """Bernstein coefficients (degree + 1, size) on the unit segment of a derivative of the basis, a polynomial."""
-    order = system.size - 1
-    powers = system.taylor(np.zeros(1), order)[:, :, 0].T  # coefficient of each power
-    derived = powers[nu:] * (FACTORIALS[nu : order + 1] / FACTORIALS[: max(order + 1 - nu, 0)])[:, None]
-    degree = max(order - nu, 0)
-    if not len(derived):
-        return np.zeros((1, system.size))
-    return np.asarray(bernstein_of_powers(degree) @ derived)
 
 
 def _gathered(run: Run, segments: NDArray[np.intp], u: Array, order: int) -> Array:

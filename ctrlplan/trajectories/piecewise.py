@@ -20,6 +20,7 @@ from ctrlplan.trajectories.conjugate import FreeEntries, Kind, kinds_of, rounded
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.pieces import Pieces, fitted, scales
+from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
@@ -38,8 +39,8 @@ _WITHIN = readonly(np.linspace(0.0, 1.0, 13))
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
-_FEW, _MANY = 16, 1000
-"""Number of segments up to which each is evaluated by itself, and number of times in each above which it is."""
+_MANY = 1000
+"""Number of times in each segment above which segments are evaluated one after the other."""
 
 
 class PiecewiseSpline(WaypointSpline):
@@ -85,6 +86,7 @@ class PiecewiseSpline(WaypointSpline):
     """
 
     family = "piecewise"
+    is_linear = True
     options = ("alpha",)
 
     alpha: float
@@ -342,6 +344,9 @@ class PiecewiseSpline(WaypointSpline):
         period = None if self._period is None else self._period / rate
         return self._again(self._entries.scaled(times, rate), self._warn, period=period)
 
+    def _marked_times(self) -> Array:
+        return self.breakpoints
+
     def quiet(self) -> Self:
         """The same plan without warnings of `through` and `with_values`."""
         return self._with_fields(_warn=False)
@@ -432,7 +437,7 @@ class PiecewiseSpline(WaypointSpline):
             segments[t == times[-1]] = last
         inside = (segments >= 0) & (segments <= last)
         touched = min(int(np.count_nonzero(np.diff(segments))) + 1, last + 1)
-        if touched <= _FEW or t.size > _MANY * touched or self._is_extreme(high) or not inside.all():
+        if touched == 1 or t.size > _MANY * touched or self._is_extreme(high) or not inside.all():
             return super()._sample(t, low, high, left)
         with np.errstate(over="ignore", invalid="ignore"):
             out = self._jets(segments, t - times[segments], low, high)
@@ -459,17 +464,12 @@ class PiecewiseSpline(WaypointSpline):
     def _durations(self) -> Array:
         return readonly(np.diff(self.breakpoints))
 
-    def derivative_bounds(self, nu: int) -> tuple[Array, Array] | None:
-        """Bounds of a derivative on each segment; as `Trajectory.derivative_bounds`."""
-        if self.alpha or self.breakpoints.size <= _FEW:
+    def stationary_places(self, nu: int) -> tuple[NDArray[np.intp], Array] | None:
+        """Places of the stationary points of polynomials; as `Trajectory.stationary_places`."""
+        if self.alpha:
             return None
-        low, high = np.empty((2, self.naxes, self.breakpoints.size - 1))
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
-            scale = self._durations**-nu
-            for pieces in self._pieces:
-                own = pieces.derivative_bounds(nu)
-                low[list(pieces.axes)], high[list(pieces.axes)] = own[0] * scale, own[1] * scale
-        return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else None
+        groups = ([Polynomials(run.system, run.first, run.coefficients) for run in p.runs] for p in self._pieces)
+        return stationary_places(groups, self._durations, nu)
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""

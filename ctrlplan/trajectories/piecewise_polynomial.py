@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import MAXIMUM, checked_labels, new_numbers
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers, mapped_time, times_powers
+from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, times_powers
 from ctrlplan.trajectories.motion_profile import shifted
+from ctrlplan.trajectories.piecewise_extrema import Polynomials, Powers, stationary_places
 from ctrlplan.trajectories.trajectory import Trajectory
 
 _FEW, _MANY = 16, 1000
@@ -142,21 +143,20 @@ class PiecewisePolynomial(Trajectory):
                     out[k, :, part] = row
         return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
-    def derivative_bounds(self, nu: int) -> tuple[Array, Array] | None:
-        """Bounds of a derivative on each segment; as `Trajectory.derivative_bounds`."""
-        if nu >= len(self.coefficients):
-            zero = np.zeros((self.naxes, self.breakpoints.size - 1))
-            return zero, zero
-        degree = len(self.coefficients) - 1 - nu
-        matrix = bernstein_of_powers(degree)
+    def stationary_places(self, nu: int) -> tuple[NDArray[np.intp], Array] | None:
+        """Places of the stationary points; as `Trajectory.stationary_places`."""
+        durations, size = np.diff(self.breakpoints), len(self._jets)
         with np.errstate(over="ignore", invalid="ignore", under="ignore"):
-            powers = (np.diff(self.breakpoints) ** np.arange(degree + 1)[:, None])[:, None]
-            terms = self._jets[nu:] / FACTORIALS[: degree + 1, None, None] * powers
-            values = np.tensordot(matrix, terms, 1)
-            # Sums of as many terms as powers, each with two rounded factors.
-            rounding = (degree + 4) * np.finfo(float).eps * np.abs(terms).sum(axis=0)
-            low, high = values.min(axis=0) - rounding, values.max(axis=0) + rounding
-        return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else None
+            powers = (durations ** np.arange(size)[:, None])[:, None] / FACTORIALS[:size, None, None]
+            own = Polynomials(Powers(size), 0, self._jets * powers)
+        return stationary_places([[own]], durations, nu)
+
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""
+        found = np.zeros((order + 1, self.naxes, s.size))
+        for row, values in zip(found, shifted(self._jets[:, :, segments], s, order), strict=False):
+            row[:] = values
+        return found
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""

@@ -1021,6 +1021,10 @@ class Trajectory(Displayed, Fields, ABC):
             raise ValueError(f"t1 must not be below t0, got {last:g} s after {first:g} s")
         return first, last
 
+    def _marked_times(self) -> Array:
+        """Times of breakpoints and waypoints, increasing."""
+        return np.union1d(self.breakpoints, [w.time for w in self.waypoints])
+
     def _moved(self, origin: float, target: float, rate: float) -> Self:
         """As `map_time`, with a check of the rounding of the intervals between times."""
         try:
@@ -1030,7 +1034,7 @@ class Trajectory(Displayed, Fields, ABC):
             raise ValueError(f"times must stay within floating point, got a rate of {rate:g}: {error}") from None
         if self.in_batches:
             _extrema.carry_extrema(self, moved, rate)
-        before, after = (np.union1d(p.breakpoints, [w.time for w in p.waypoints]) for p in (self, moved))
+        before, after = self._marked_times(), moved._marked_times()
         if before.size < 2:
             return moved
         # A profile omits segments below the resolution of times; the cells of a time law do not depend on it.
@@ -1129,10 +1133,17 @@ class Trajectory(Displayed, Fields, ABC):
                 f"of {np.abs(self.segment_jet(segment, np.zeros(1), 0)).max():g}"
             )
 
-    def derivative_bounds(self, nu: int) -> tuple[Array, Array] | None:
-        """Bounds of a derivative on each segment, or None.
+    def stationary_places(self, nu: int) -> tuple[NDArray[np.intp], Array] | None:
+        """Stationary points of a derivative that may be extrema.
 
-        With them `extrema` searches only segments that can contain one.
+        If a class returns them, `extrema` does not search each segment.
+
+        Returns
+        -------
+        segments : ndarray of int, shape (npoints,)
+            Segment of each point.
+        s : ndarray, shape (npoints,)
+            Time [s] since its start.
         """
         return None
 

@@ -103,6 +103,9 @@ class WaypointSpline(Trajectory, FromWaypoints):
     2.0
     """
 
+    is_linear: ClassVar[bool] = False
+    """Whether positions at fixed times depend linearly on the entries of the waypoints."""
+
     waypoints: tuple[Waypoint, ...]
 
     @classmethod

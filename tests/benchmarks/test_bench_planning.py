@@ -5,7 +5,7 @@ Wanted on one core: choose_alpha on 12 constraints and 2 axes under 50 ms, faste
 
 from itertools import pairwise
 from statistics import median
-from time import perf_counter
+from time import perf_counter, process_time
 
 import numpy as np
 import pytest
@@ -113,3 +113,52 @@ def test_fastest_within_limits_of_derivatives(beside, hold):
     if hold == "path":
         assert best.duration <= peer() * (1 + 1e-6)
     beside(lambda: cp.fastest(plan, limits, hold=hold), peer, rounds=3)
+
+
+def through(n):
+    """A piecewise spline through n random waypoints, at rest at both ends."""
+    times, ends = np.cumsum(RNG.uniform(0.5, 1.5, n)), [[0.0, 0.0], [0.0, 0.0]]
+    points = [
+        cp.Waypoint(t, position, *(ends if i in (0, n - 1) else []))
+        for i, (t, position) in enumerate(zip(times.tolist(), RNG.normal(size=(n, 2)), strict=True))
+    ]
+    return cp.PiecewiseSpline(points, warn=False)
+
+
+RNG = np.random.default_rng(0)
+FAMILIES = {
+    "polynomial": lambda: cp.PolySpline(through(2).waypoints),
+    "trigonometric": lambda: cp.TrigSpline(through(4).waypoints, alpha=1.0, warn=False),
+    "piecewise 2": lambda: through(2),
+    "piecewise 4": lambda: through(4),
+    "piecewise 10": lambda: through(10),
+    "piecewise 50": lambda: through(50),
+}
+
+
+@pytest.mark.benchmark(group="fastest")
+@pytest.mark.parametrize("name", FAMILIES)
+def test_fastest_next_to_the_closed_form_on_samples(benchmark, capsys, name):
+    """Peer: T_0 max (peak/limit)^(1/k) of 2001 samples, which is not certified. Goal: at most 10."""
+    limits, plans = {"velocity": 5.0, "acceleration": 3.0}, [FAMILIES[name]() for _ in range(12)]
+
+    def peer(plan):
+        peaks = np.abs(plan.jet(np.linspace(plan.start, plan.end, 2001), 2)).max(axis=(1, 2))
+        return plan.duration * max(peaks[1] / 5.0, np.sqrt(peaks[2] / 3.0))
+
+    rows = []
+    for plan in plans:
+        row = []
+        for function in (lambda plan: cp.fastest(plan, limits), peer):
+            begin = process_time()
+            found = function(plan)
+            row.append(process_time() - begin)
+        rows.append(row)
+        assert found <= cp.fastest(plan, limits).duration * (1 + 1e-12) <= found * (1 + 2e-3)
+        assert cp.fastest(plan, limits).margins.satisfied
+    ratio = median(a / b for a, b in rows)
+    benchmark.extra_info["ratio"] = ratio
+    benchmark.pedantic(lambda: cp.fastest(FAMILIES[name](), limits), rounds=3)
+    own, other = (1e3 * median(column) for column in zip(*rows, strict=True))
+    with capsys.disabled():
+        print(f"\nfastest, {name}: {own:.2f} ms, closed form on 2001 samples {other:.2f} ms, ratio {ratio:.1f}")

@@ -562,10 +562,11 @@ def test_a_plan_that_does_not_move(position, hold):
 def test_a_search_that_ends_where_limits_come_nearer_says_so():
     far = cp.PolySpline([Waypoint(0, 0, 0.1), Waypoint(1, 20, 0.1)])
     with pytest.raises(ValueError, match=r"from 0.01562 to 64 s, got none.* for a wider search pass durations="):
-        fastest(far, {"velocity": 0.2}, hold="waypoints")
-    found = fastest(far, {"velocity": 0.2}, hold="waypoints", durations=(10.0, 1000.0))
-    # y' is 0.1 at the ends and 1.5 d/T - 0.05 in the middle.
-    assert found.duration == pytest.approx(1.5 * 20 / 0.25, rel=1e-9)
+        fastest(far, {"velocity": 0.2}, hold="waypoints", durations=(1 / 64, 64.0))
+    for durations in ((10.0, 1000.0), None):
+        found = fastest(far, {"velocity": 0.2}, hold="waypoints", durations=durations)
+        # y' is 0.1 at the ends and 1.5 d/T - 0.05 in the middle.
+        assert found.duration == pytest.approx(1.5 * 20 / 0.25, rel=1e-9)
     inside = cp.PolySpline([Waypoint(0, 0, 1, 0), Waypoint(1, 1, 1, 0)])
     with pytest.raises(ValueError, match=r"got none; nearest at [0-9.]+ s: y_d1 within ±0.9: [^;]*$"):
         fastest(inside, {"velocity": 0.9, "y_d2": 1.0}, hold="waypoints", durations=(0.5, 50.0))

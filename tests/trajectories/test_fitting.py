@@ -69,16 +69,11 @@ def test_smoothing_is_that_of_splrep():
 
 
 def test_peaks_hold_between_the_samples():
-    """Derivative bounds contain the derivatives on each segment; the peak is attained and exceeded nowhere."""
+    """The peak is attained and exceeded nowhere."""
     plan = cp.fit(T, NOISY, tolerance=[0.05, 5.0], continuity=4)
     s = np.linspace(plan.start, plan.end, 20_001)
-    inside = np.searchsorted(plan.breakpoints[:-1], s, side="right") - 1
     for nu in range(7):
-        low, high = plan.derivative_bounds(nu)
         values = plan.jet(s, nu)[nu]
-        slack = 1e-9 * np.abs(values).max(axis=1, keepdims=True)
-        assert (values >= low[:, inside] - slack).all()
-        assert (values <= high[:, inside] + slack).all()
         assert (np.abs(values).max(axis=1) <= plan.peak(nu) * (1 + 1e-12)).all()
         assert (np.abs(values).max(axis=1) >= 0.98 * plan.peak(nu)).all()
 

@@ -371,12 +371,9 @@ def test_extrema_of_many_segments_are_those_of_each(nu):
     given[2][1, 40] = 30.0
     plan = PiecewiseSpline.from_arrays(times, values, derivatives=given)
     found = plan.extrema(nu)
-    low, high = plan.derivative_bounds(nu)
     for k in range(119):
         t = np.linspace(0.0, times[k + 1] - times[k], 401)
         inside = plan.segment_jet(k, t, nu)[nu]
-        assert (inside.min(axis=1) >= low[:, k]).all()
-        assert (inside.max(axis=1) <= high[:, k]).all()
         slack = 1e-12 * np.abs(inside).max(axis=1)
         assert (inside.max(axis=1) <= found.maximum + slack).all()
         assert (inside.min(axis=1) >= found.minimum - slack).all()
@@ -399,9 +396,11 @@ def test_only_segments_that_can_hold_an_extremum_are_searched(monkeypatch):
     times, values = data(1000, 1)
     plan = PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(1000, 2))
     searched = []
-    before = PiecewiseSpline.segment_jet
+    before, durations = PiecewiseSpline.segments_jet, np.diff(times)
     monkeypatch.setattr(
-        PiecewiseSpline, "segment_jet", lambda self, k, s, order: searched.append(k) or before(self, k, s, order)
+        PiecewiseSpline,
+        "segments_jet",
+        lambda self, k, s, order: searched.extend(k[(s > 0.0) & (s < durations[k])]) or before(self, k, s, order),
     )
     plan.extrema(1)
-    assert len(set(searched)) <= 50
+    assert 1 <= len(set(searched)) <= 20
