@@ -128,13 +128,12 @@ class TVLQR(Displayed):
 
         Raises
         ------
-        TypeError
-            If the flat system is not derived from equations.
+        ImportError
+            If the Jacobians of the flat system must be derived without the extra ``fast``.
         ValueError
             If weights have wrong shapes or are not positive, or `final` is required.
         """
-        if not isinstance(flat, DerivedFlatSystem):
-            raise TypeError(f"flat must be a flat system from equations for TVLQR, got {type(flat).__name__}")
+        flat = flat.derived
         check_end(plan)
         n, m = flat.nstates, flat.ninputs
         q, r = _weight(self.Q, "Q", n, strict=False), _weight(self.R, "R", m, strict=True)

@@ -112,8 +112,18 @@ def test_riccati_law_returns_a_car_to_its_lane():
     ):
         with pytest.raises(ValueError, match=r"(Q|R) must"):
             cp.flat_loop(CAR, LANE, law=wrong)
-    with pytest.raises(TypeError, match="from equations"):
-        cp.flat_loop(MOTOR, TURN, law=cp.TVLQR(np.eye(3), np.eye(1)))
+
+
+def test_riccati_gains_of_maps_by_formulas_are_those_of_the_equations():
+    """The motor is linear: the stationary gain is that of its matrices."""
+    R, L, K, J, b = 1.0, 0.5, 0.01, 0.01, 0.1
+    a = [[0, 1, 0], [0, -b / J, K / J], [0, -K / L, -R / L]]
+    gain, after = cp.TVLQR(np.eye(3), np.eye(1)).gains(MOTOR, TURN)
+    known = ct.lqr(np.array(a), np.array([[0.0], [0.0], [1.0 / L]]), np.eye(3), np.eye(1))[0]
+    np.testing.assert_allclose(after, known, rtol=1e-9)
+    np.testing.assert_allclose(gain(0.5), known, rtol=1e-6)
+    loop = cp.flat_loop(MOTOR, TURN, law=cp.TVLQR(np.eye(3), np.eye(1)))
+    np.testing.assert_allclose(cp.simulate(loop, [0.0, 0.5, 1.0]).outputs["angle"], TURN([0.0, 0.5, 1.0]), atol=1e-6)
 
 
 def test_after_the_end_the_stationary_gain_is_used():
