@@ -128,13 +128,12 @@ class TVLQR(Displayed):
 
         Raises
         ------
-        TypeError
-            If the flat system is not derived from equations.
+        ImportError
+            If the Jacobians of the flat system must be derived without the extra ``fast``.
         ValueError
             If weights have wrong shapes or are not positive, or `final` is required.
         """
-        if not isinstance(flat, DerivedFlatSystem):
-            raise TypeError(f"flat must be a flat system from equations for TVLQR, got {type(flat).__name__}")
+        flat = flat.derived
         check_end(plan)
         n, m = flat.nstates, flat.ninputs
         q, r = _weight(self.Q, "Q", n, strict=False), _weight(self.R, "R", m, strict=True)
@@ -247,7 +246,8 @@ def flat_loop(
     Raises
     ------
     TypeError, ValueError
-        If arguments are wrong, or the states along the plan are not determined.
+        If arguments are wrong, the plan is a step, or the states along it are not
+        determined.
 
     Examples
     --------
@@ -267,6 +267,7 @@ def flat_loop(
     if not isinstance(chosen, FlatLaw | Feedforward | TVLQR):
         raise TypeError(f"law must be a FlatLaw, Feedforward or TVLQR, got {type(chosen).__name__}")
     axes = flat.matched(plan)
+    _check_no_step(axes, flat)
     plant = _plant(flat, disturbances)
     controller = chosen.create(flat, axes, limits)
     blocks = [controller, plant]
@@ -287,6 +288,15 @@ def flat_loop(
     own = traits_of(controller).initial_state if controller.nstates else None
     start = checked_vector(first, "initial_state", flat.nstates) if np.ndim(first) else _wrong_state(first, flat)
     return declare(loop, initial_state=np.concatenate([np.zeros(0) if own is None else own, start]))
+
+
+def _check_no_step(plan: Trajectory, flat: FlatSystem) -> None:
+    """Raise for a plan whose position jumps."""
+    for jump in plan.jumps(0)[:1]:
+        raise ValueError(
+            f"plan must be continuous for a law of {flat.name}, got a step of {jump.label} by {jump.size:.4g} at "
+            f"{jump.time:g} s; give a plan at rest at the goal, and initial_state= from which it is approached"
+        )
 
 
 def _wrong_state(given: Value, flat: FlatSystem) -> Array:

@@ -112,8 +112,18 @@ def test_riccati_law_returns_a_car_to_its_lane():
     ):
         with pytest.raises(ValueError, match=r"(Q|R) must"):
             cp.flat_loop(CAR, LANE, law=wrong)
-    with pytest.raises(TypeError, match="from equations"):
-        cp.flat_loop(MOTOR, TURN, law=cp.TVLQR(np.eye(3), np.eye(1)))
+
+
+def test_riccati_gains_of_maps_by_formulas_are_those_of_the_equations():
+    """The motor is linear: the stationary gain is that of its matrices."""
+    R, L, K, J, b = 1.0, 0.5, 0.01, 0.01, 0.1
+    a = [[0, 1, 0], [0, -b / J, K / J], [0, -K / L, -R / L]]
+    gain, after = cp.TVLQR(np.eye(3), np.eye(1)).gains(MOTOR, TURN)
+    known = ct.lqr(np.array(a), np.array([[0.0], [0.0], [1.0 / L]]), np.eye(3), np.eye(1))[0]
+    np.testing.assert_allclose(after, known, rtol=1e-9)
+    np.testing.assert_allclose(gain(0.5), known, rtol=1e-6)
+    loop = cp.flat_loop(MOTOR, TURN, law=cp.TVLQR(np.eye(3), np.eye(1)))
+    np.testing.assert_allclose(cp.simulate(loop, [0.0, 0.5, 1.0]).outputs["angle"], TURN([0.0, 0.5, 1.0]), atol=1e-6)
 
 
 def test_after_the_end_the_stationary_gain_is_used():
@@ -174,6 +184,21 @@ def test_bad_arguments_of_a_loop():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("law", [cp.FlatLaw([-20, -25, -30]), cp.Feedforward(), cp.TVLQR(np.eye(3), np.eye(1))])
+def test_a_step_is_rejected(law):
+    with pytest.raises(ValueError, match=r"plan must be continuous .* got a step of angle by 2 at 0\.3 s; give a plan"):
+        cp.flat_loop(MOTOR, cp.Step(2.0, time=0.3, labels="angle"), law=law)
+
+
+def test_a_set_point_is_a_plan_at_rest():
+    """The error is that of a chain of integrators with the poles of the law."""
+    rest = cp.PolySpline([cp.Waypoint(0, 2.0, 0, 0), cp.Waypoint(1, 2.0, 0, 0)], labels="angle")
+    t, p = np.linspace(0.0, 1.5, 16), np.array([-20.0, -25.0, -30.0])
+    loop = cp.flat_loop(MOTOR, rest, law=cp.FlatLaw(p), initial_state=[0.0, 0.0, 0.0])
+    c = np.linalg.solve(np.vander(p, 3, increasing=True).T, [-2.0, 0.0, 0.0])
+    np.testing.assert_allclose(cp.simulate(loop, t).outputs["angle"], 2.0 + np.exp(np.outer(t, p)) @ c, atol=1e-6)
+
+
 def test_equality_with_zero_is_no_switch():
     """A law evaluates elsewhere where all its inputs are 0: this makes no breakpoints where one of them crosses 0."""
     flat = crane()

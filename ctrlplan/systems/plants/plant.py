@@ -114,8 +114,8 @@ class Plant(Displayed, ABC):
             Name of the system. Default: that of the plant.
         maps : {"closed_form", "derived"}, optional
             Flat maps by the formulas of the literature, or derived from the
-            equations, which requires the extra ``fast``. Both agree; only derived
-            ones have Jacobians, for `ctrlplan.TVLQR`.
+            equations, which requires the extra ``fast``. Both agree; laws that need
+            more than closed-form maps derive the others themselves.
         at : mapping of str to float, optional
             Values of states and inputs that select a branch of the maps, such as
             ``{"v": -1.0}`` for a car in reverse. Default: the usual operation.
