@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,9 @@ _FEW = 16
 
 _TOGETHER = 2**15
 """Number of different steps whose products are stored together."""
+
+_TABLE = 4_000_000
+"""Maximum number of entries of the matrix of a part with delay lines."""
 
 _STEPS = 512
 """Number of steps without a pattern from which growth is estimated."""
@@ -81,6 +86,134 @@ def marched(state: Array, matrices: Array, kinds: NDArray[np.intp], forced: Arra
         after = _in_blocks(found[begin], matrices, kinds[some], forced[some])
         found[begin + 1 : begin + 1 + len(after)] = after
     return found if np.isfinite(found).all() else _one_by_one(state, matrices, kinds, forced)
+
+
+@dataclass(frozen=True, eq=False)
+class DelayLine:
+    """Values that return to the states some samples later.
+
+    Attributes
+    ----------
+    count : int
+        Number of samples after which a value returns.
+    places : ndarray of int
+        Indices of the states after which values are taken, and at which earlier ones return.
+    initial : ndarray, shape (width,)
+        What returns before the first value.
+    out : ndarray, shape (width, nstates)
+        Values from the states.
+    given : ndarray, shape (nplaces, width)
+        What is added to the values.
+    into : ndarray, shape (nplaces, nstates, width)
+        Change of the states by what returns; a broadcast view if it is the same for all.
+    """
+
+    count: int
+    places: NDArray[np.intp]
+    initial: Array
+    out: Array
+    given: Array
+    into: Array
+
+    @property
+    def at_start(self) -> bool:
+        """Whether a value is taken from the first state."""
+        return bool(self.places.size and self.places[0] == 0)
+
+    def returning(self, values: Array, which: NDArray[np.intp]) -> Array:
+        """What returns (n, width) at some places."""
+        earlier = values[np.maximum(which - self.count, 0)]
+        return np.where((which < self.count)[:, None], self.initial, earlier)
+
+    def between(self, begin: int, end: int) -> NDArray[np.intp]:
+        """Numbers of the places after one state and up to another."""
+        return np.arange(*np.searchsorted(self.places, [begin, end], side="right"))
+
+
+def marched_with_lines(
+    state: Array, matrices: Array, kinds: NDArray[np.intp], forced: Array, lines: Sequence[DelayLine]
+) -> Array:
+    """The same as `marched` with delay lines, of which the first state already has what returns there."""
+    if not lines:
+        return marched(state, matrices, kinds, forced)
+    nsteps, n = forced.shape
+    found = np.empty((nsteps + 1, n))
+    found[0] = state
+    values = [np.empty_like(line.given) for line in lines]
+    for line, own in zip(lines, values, strict=True):
+        if line.at_start:
+            own[0] = line.out @ state + line.given[0]
+    first, length = _pattern(kinds)
+    begin = 0
+    while begin < nsteps:
+        # What returns within a part was taken before it.
+        ends = [line.places[line.between(-1, begin).size + line.count :][:1] for line in lines]
+        end = min([nsteps, *(int(own[0]) - 1 for own in ends if own.size)])
+        if length and begin >= first and end - begin >= length:
+            end = begin + (end - begin) // length * length
+            count = (nsteps - begin) // (end - begin)
+            if count >= _PATTERN and (end - begin) * n * (n + sum(line.count for line in lines)) < _TABLE:
+                begin = _by_table(found, values, matrices, kinds, forced, lines, begin, end - begin, count)
+                continue
+        given = forced[begin:end].copy()
+        which = [line.between(begin, end) for line in lines]
+        for line, own, some in zip(lines, values, which, strict=True):
+            given[line.places[some] - 1 - begin] += np.matmul(line.into[some], line.returning(own, some)[..., None])[
+                ..., 0
+            ]
+        found[begin + 1 : end + 1] = marched(found[begin], matrices, kinds[begin:end], given)[1:]
+        for line, own, some in zip(lines, values, which, strict=True):
+            own[some] = found[line.places[some]] @ line.out.T + line.given[some]
+        begin = end
+    return found
+
+
+def _by_table(
+    found: Array,
+    values: list[Array],
+    matrices: Array,
+    kinds: NDArray[np.intp],
+    forced: Array,
+    lines: Sequence[DelayLine],
+    begin: int,
+    size: int,
+    count: int,
+) -> int:
+    """Compute `count` equal parts of `size` steps by one matrix from their first states and what returns."""
+    n, last = found.shape[1], begin + size * count
+    own = matrices[kinds[begin : begin + size]]
+    inner = forced[begin:last].reshape(count, size, n).copy()
+    for j in range(1, size):
+        inner[:, j] += inner[:, j - 1] @ own[j].T
+    which = [line.between(begin, begin + size) for line in lines]
+    columns = np.cumsum([n, *(some.size * line.given.shape[1] for line, some in zip(lines, which, strict=True))])
+    known = np.eye(n, columns[-1])
+    table = np.empty((size, n, columns[-1]))
+    for j in range(size):
+        known = own[j] @ known
+        for line, some, column in zip(lines, which, columns, strict=False):
+            for k in np.flatnonzero(line.places[some] == begin + j + 1).tolist():
+                at = column + k * line.given.shape[1]
+                known[:, at : at + line.given.shape[1]] += line.into[some[k]]
+        table[j] = known
+    takes = [
+        (line.places[some] - 1 - begin, np.einsum("wn,knc->kwc", line.out, table[line.places[some] - 1 - begin]))
+        for line, some in zip(lines, which, strict=True)
+    ]
+    starts = np.empty((count, columns[-1]))
+    state = found[begin]
+    for part in range(count):
+        starts[part, :n] = state
+        for line, own_values, some, column in zip(lines, values, which, columns, strict=False):
+            back = line.returning(own_values, some + part * some.size)
+            starts[part, column : column + back.size] = back.ravel()
+        for line, own_values, some, (at, take) in zip(lines, values, which, takes, strict=True):
+            now = some + part * some.size
+            own_values[now] = take @ starts[part] + inner[part, at] @ line.out.T + line.given[now]
+        state = table[-1] @ starts[part] + inner[part, -1]
+    inner += (starts @ table.reshape(size * n, -1).T).reshape(count, size, n)
+    found[begin + 1 : last + 1] = inner.reshape(-1, n)
+    return last
 
 
 def growth(matrices: Array, kinds: NDArray[np.intp]) -> float:

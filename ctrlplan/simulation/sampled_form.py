@@ -31,8 +31,8 @@ from ctrlplan.simulation.segments import as_fraction
 Timing = tuple[Fraction, Fraction]
 """Period and offset [s]: sample times are offset, offset + period, ... after the start of a run."""
 
-_LARGEST = 400
-"""Maximum number of states, registers included."""
+_SHORT = 16
+"""Number of samples up to which a register is part of the states."""
 
 _TIMINGS = 62
 """Maximum number of different periods and offsets, one bit each."""
@@ -67,6 +67,32 @@ class Sampled:
     d: Array
     states: NDArray[np.intp]
     held: NDArray[np.intp]
+    from_z: Array
+    from_w: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """Register of many samples, outside of the states.
+
+    Attributes
+    ----------
+    columns : slice
+        Places of what it returns among w, after the functions of time.
+    timing : (Fraction, Fraction)
+        Period and offset.
+    count : int
+        Number of samples.
+    initial : ndarray, shape (width,)
+        What it returns before the first sample.
+    from_z, from_w : ndarray
+        Its inputs.
+    """
+
+    columns: slice
+    timing: Timing
+    count: int
+    initial: Array
     from_z: Array
     from_w: Array
 
@@ -124,6 +150,8 @@ class SampledForm:
         Delays.
     registers : ndarray, shape (nz - nstates,)
         Initial states of the registers.
+    lines : tuple of Line
+        Registers of many samples. What they return follows the functions of time in w at an instant.
     """
 
     name: str
@@ -137,6 +165,7 @@ class SampledForm:
     parts: tuple[Sampled, ...]
     lates: tuple[Late, ...]
     registers: Array
+    lines: tuple[Line, ...] = ()
     _jumps: dict[int, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -177,7 +206,8 @@ class SampledForm:
         return self._jumps[due]
 
     def _new_jump(self, due: int) -> tuple[Array, Array]:
-        size, nw = self.signals_z.shape[1], self.signals_w.shape[1]
+        size = self.signals_z.shape[1]
+        nw = max([self.signals_w.shape[1], *(line.columns.stop for line in self.lines)])
         chosen = [part for part in self.parts if due >> self.timings.index(part.timing) & 1]
         held = np.concatenate([np.zeros(0, dtype=np.intp), *(part.held for part in chosen)])
         # h+ = C xi + D (from_z z+ + from_w w), where z+ has the new h of all parts that are due.
@@ -310,15 +340,16 @@ class _Delays:
         self._columns = dict(_time_columns(network))
         self._parts, self._lates = list(form.parts), list[Late]()
         self._initial: list[Array] = []
-        self._size = form.nstates
+        self._size, self._returned, self._lines = form.nstates, 0, list[Line]()
         self._held: dict[int, Array] = {}  # outputs of a delay from what its registers hold
 
     def replaced(self) -> SampledForm:
         """Form with registers in place of the delays."""
         for i in self._in_order():
             self._replace(i)
-        form, size = self._form, self._size
-        parts = [replace(part, from_z=_wide(part.from_z, size)) for part in self._parts]
+        form, size, nw = self._form, self._size, self._form.signals_w.shape[1] + self._returned
+        parts = [replace(p, from_z=_wide(p.from_z, size), from_w=_wide(p.from_w, nw)) for p in self._parts]
+        lines = [replace(line, from_z=_wide(line.from_z, size)) for line in self._lines]
         a, signals = _wide(form.a, size), _wide(form.signals_z, size)
         for i, held in self._held.items():
             columns, own = self._columns[i], _wide(held, size)
@@ -326,6 +357,8 @@ class _Delays:
             signals = signals + form.signals_w[:, columns] @ own
             for k, part in enumerate(parts):
                 parts[k] = replace(part, from_z=part.from_z + part.from_w[:, columns] @ own)
+            for k, line in enumerate(lines):
+                lines[k] = replace(line, from_z=line.from_z + line.from_w[:, columns] @ own)
         lates = [
             replace(
                 late,
@@ -340,6 +373,7 @@ class _Delays:
             signals_z=signals,
             parts=tuple(parts),
             lates=tuple(lates),
+            lines=tuple(lines),
             registers=np.concatenate([np.zeros(0), *self._initial]),
         )
 
@@ -406,22 +440,35 @@ class _Delays:
     ) -> NDArray[np.intp]:
         """Add a register of some samples; return the places of what it holds."""
         width = initial.size
+        name = self._network.blocks[i].name
+        if count > _SHORT:
+            return self._line(name, timing, count, from_z, from_w, initial)
         n = count * width
-        if self._size + n > _LARGEST:
-            raise NotLinearError(
-                f"block {self._network.blocks[i].name} is a delay of {count} periods, which takes more than {_LARGEST} "
-                "states"
-            )
         states = self._size + np.arange(n)
         held = self._size + n + np.arange(width)
         a, b = np.eye(n, k=-width), np.eye(n, width)
         c, d = np.eye(width, n, n - width), np.zeros((width, width))
         if not count:
             c, d = np.zeros((width, 0)), np.eye(width)
-        name = self._network.blocks[i].name
         self._size += n + width
         self._initial.append(np.tile(initial, count + 1))
         self._parts.append(Sampled(name, timing, a, b, c, d, states, held, from_z, from_w))
+        return held
+
+    def _line(
+        self, name: str, timing: Timing, count: int, from_z: Array, from_w: Array, initial: Array
+    ) -> NDArray[np.intp]:
+        """Add a register of many samples; return the places of what it holds."""
+        width, nw, before = initial.size, self._form.signals_w.shape[1], self._returned
+        held = self._size + np.arange(width)
+        nothing, none = np.zeros((0, width)), np.zeros((width, self._size))
+        returned = np.eye(width, nw + before + width, nw + before)
+        self._lines.append(Line(slice(nw + before, nw + before + width), timing, count, initial, from_z, from_w))
+        self._parts.append(
+            Sampled(name, timing, np.zeros((0, 0)), nothing, nothing.T, np.eye(width), held[:0], held, none, returned)
+        )
+        self._size, self._returned = self._size + width, before + width
+        self._initial.append(initial)
         return held
 
 

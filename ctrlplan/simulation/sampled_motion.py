@@ -9,6 +9,7 @@ parts. Whatever the position of a breakpoint, each side is read where it is vali
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -21,8 +22,8 @@ from ctrlplan.simulation.cell_extrema import Cells, joined
 from ctrlplan.simulation.flow_kernel import REACH, FlowKernel, gauss_nodes, to_legendre
 from ctrlplan.simulation.instants import Instants, instants_of
 from ctrlplan.simulation.interpreted import SolverError
-from ctrlplan.simulation.recurrences import growth, marched
-from ctrlplan.simulation.sampled_form import Late, SampledForm
+from ctrlplan.simulation.recurrences import DelayLine, growth, marched_with_lines
+from ctrlplan.simulation.sampled_form import Late, Line, SampledForm
 from ctrlplan.simulation.segments import time_tolerance, values_after
 from ctrlplan.simulation.signals import TimeSignal, signal_values
 from ctrlplan.trajectories.chebyshev import points, transform
@@ -228,7 +229,13 @@ class SampledMotion:
     @property
     def growth(self) -> float:
         """Growth of a perturbation of the states over the run, about."""
-        return growth(*self._steps)
+        if not self._lines:
+            return growth(*self._steps)
+        matrices, kinds = self._steps
+        lines = [replace(line, initial=0.0 * line.initial, given=0.0 * line.given) for line in self._lines]
+        start = np.random.default_rng(0).standard_normal(matrices.shape[1])
+        free = marched_with_lines(np.asarray(start), matrices, kinds, np.zeros((kinds.size, start.size)), lines)
+        return float(np.abs(free).max(initial=0.0) / np.abs(start).max())
 
     def registers_at(self, times: Array) -> Array:
         """States (nz - nstates, ntime) of the registers."""
@@ -243,7 +250,8 @@ class SampledMotion:
         form, instants, moving = self.form, self.instants, self.form.moving
         masks, due = np.unique(instants.due, return_inverse=True)
         jumps = [form.jump(int(mask)) for mask in masks]
-        read = _Chosen(self._signals, np.flatnonzero(np.any([k.any(axis=0) for _, k in jumps], axis=0)))
+        nw = form.signals_w.shape[1]
+        read = _Chosen(self._signals, np.flatnonzero(np.any([k[:, :nw].any(axis=0) for _, k in jumps], axis=0)))
         values = read.after(instants.times, self.tolerance).T
         forced = np.empty((instants.times.size, z.size))
         moved = self._forced()
@@ -261,13 +269,27 @@ class SampledMotion:
             own = np.flatnonzero(masks_of == k)
             matrices[own] = np.matmul(jump[:, moving], flows[lengths[own]]) + jump
         self._steps = matrices, kinds
-        found = marched(jumps[due[0]][0] @ z + forced[0], matrices, kinds, forced[1:])
+        self._lines = [self._line(line, [jump[1] for jump in jumps], due) for line in form.lines]
+        start = jumps[due[0]][0] @ z + forced[0]
+        for line in self._lines:
+            if line.at_start:
+                start += line.into[0] @ line.initial
+        found = marched_with_lines(start, matrices, kinds, forced[1:], self._lines)
         if not np.isfinite(found).all():
             at = instants.times[int(np.argmin(np.isfinite(found).all(axis=1)))]
             raise SolverError(
                 f"states of {form.name} must stay finite up to {instants.times[-1]:g} s, got an overflow at {at:g} s"
             )
         return found
+
+    def _line(self, line: Line, inputs: Sequence[Array], due: NDArray[np.intp]) -> DelayLine:
+        """A register of many samples as a delay line between instants; inputs: K of the different instants `due`."""
+        bit = self.form.timings.index(line.timing)
+        places = np.flatnonzero(self.instants.due >> bit & 1)
+        read = _Chosen(self._signals, np.flatnonzero(line.from_w.any(axis=0)))
+        given = read.after(self.instants.times[places], self.tolerance).T @ line.from_w[:, read.columns].T
+        into = np.array([k[:, line.columns] for k in inputs])[due[places]]
+        return DelayLine(line.count, places, line.initial, line.from_z, given, into)
 
     def _forced(self) -> Array:
         """Responses (nintervals, nx) of the flow to functions of time over each interval, from zero."""

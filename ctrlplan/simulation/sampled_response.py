@@ -332,9 +332,12 @@ class SampledResponse(LoopResponse):
 
 
 def has_exact_signals(form: SampledForm) -> bool:
-    """Whether signals of a loop have exact extrema: its sample times repeat, and no output is a late continuous one."""
+    """Whether signals of a loop have exact extrema.
+
+    Its sample times must repeat, delays be short, and outputs not be delayed continuous signals.
+    """
     late = any(one.follows and form.d[:, one.columns].any() for one in form.lates)
-    return not late and _pattern(form) is not None
+    return not late and not form.lines and _pattern(form) is not None
 
 
 def _pattern(form: SampledForm) -> tuple[Fraction, Instants] | None:

@@ -4,6 +4,7 @@ A plant of third order with a law of three states, 10 s at 1 kHz; the plan enter
 matrices computed before, and makes one product a sample, or an instant: z = M z + K r.
 """
 
+from collections import deque
 from statistics import median
 from time import process_time
 
@@ -102,41 +103,53 @@ def test_one_rate(dense, benchmark, capsys):
 
 
 def instant_by_instant(first, second, offsets, delay=0.0):
-    """Two laws whose controls add up, stepped from instant to instant; the first control comes late."""
+    """Two laws whose controls add up: z = M z + K r from instant to instant; the first control comes late."""
     f, g, h, d = LAW
     events = []
     for number, (period, offset) in enumerate(((first, offsets[0]), (second, offsets[1]))):
         events += [(offset + period * j, number) for j in range(int((END - offset) / period + 1e-9) + 1)]
     if delay:
         events += [(first * j + delay, 2) for j in range(int((END - delay) / first + 1e-9) + 1)]
-    events = sorted((round(t, 12), number) for t, number in events)
-    marks = np.array(sorted({t for t, _ in events}))
-    lengths = np.diff(marks, append=END)
-    cache = {}
-    changes = [cache.setdefault(round(length, 12), held(length)) for length in lengths.tolist()]
-    due = [[] for _ in marks]
-    for t, number in events:
-        due[int(np.searchsorted(marks, t))].append(number)
-    values = PLAN(marks)
+    due = {}
+    for t, number in sorted((round(t, 12), number) for t, number in events):
+        due.setdefault(t, []).append(number)
+    marks = np.array(list(due))
+
+    def sampled(z, r, late, numbers):
+        """States x, xi and xi of the laws, their controls, and the one that is applied late, after an instant."""
+        z = z.copy()
+        for number in numbers:
+            if number == 2:
+                z[11] = late
+                continue
+            own, w = slice(3 + 3 * number, 6 + 3 * number), np.array([r, z[0]])
+            z[9 + number], z[own] = float(h[0] @ z[own] + d[0] @ w), f @ z[own] + g @ w
+            if number == 0 and not delay:
+                z[11] = z[9]
+        return z
+
+    kinds, maps = [], {}
+    for numbers, length in zip(due.values(), np.diff(marks, append=END).tolist(), strict=True):
+        kind = (tuple(numbers), round(length, 12))
+        if kind not in maps:
+            change, flow = held(length), np.eye(12)
+            flow[:3, :3], flow[:3, [10, 11]] = change[:, :3], change[:, 3:]
+            units = [(unit, 0.0, 0.0) for unit in np.eye(12)] + [(np.zeros(12), 1.0, 0.0), (np.zeros(12), 0.0, 1.0)]
+            jump = np.array([sampled(*unit, numbers) for unit in units]).T
+            maps[kind] = flow @ jump[:, :12], flow @ jump[:, 12], flow @ jump[:, 13], 2 in numbers, 0 in numbers
+        kinds.append(maps[kind])
+    values = PLAN(marks).tolist()
 
     def run():
-        x, xi, u, queue = np.zeros(4), [np.zeros(3), np.zeros(3)], [0.0, 0.0], []
-        out = np.empty((marks.size, 3))
-        for j, change in enumerate(changes):
-            for number in due[j]:
-                if number == 2:
-                    u[0] = queue.pop(0)
-                    continue
-                w = np.array([values[j], x[0]])
-                new = float(h[0] @ xi[number] + d[0] @ w)
-                xi[number] = f @ xi[number] + g @ w
-                if delay and number == 0:
-                    queue.append(new)
-                else:
-                    u[number] = new
-            x[3] = u[0] + u[1]
-            out[j] = x[:3]
-            x[:3] = change @ x
+        z, queue, out = np.zeros(12), deque(), np.empty((marks.size, 12))
+        for j, (m, k, e, returns, taken) in enumerate(kinds):
+            out[j] = z
+            late = queue.popleft() if returns else 0.0
+            z = m @ z + k * values[j]
+            if returns:
+                z += e * late
+            if taken and delay:
+                queue.append(z[9])
         return out
 
     return marks, run

@@ -141,16 +141,26 @@ def test_samples_as_input_are_straight_lines():
     assert np.abs(found.outputs - (of_input + of_held)).max() <= 1e-13
 
 
-@pytest.mark.parametrize("delay", [0.34, 0.3, 0.04, 0.1])
-def test_a_control_that_comes_late(delay):
-    """3.4, 3, 0.4 and 1 periods after it was computed."""
+DELAYS = [
+    (0.1, 0.34),
+    (0.1, 0.3),
+    (0.1, 0.04),
+    (0.1, 0.1),
+    pytest.param(0.01, 0.2, marks=pytest.mark.slow),
+    (0.01, 0.213),
+]
+"""Periods, and delays of 3.4, 3, 0.4, 1, 20 and 21.3 of them."""
+
+
+@pytest.mark.parametrize(("period", "delay"), DELAYS)
+def test_a_control_that_comes_late(period, delay):
     plan, planned = plan_and_oracle()
     late = cp.create_delay_iosystem(delay, inputs="u", outputs="w")
     loop = ct.interconnect(
-        [plant(inputs=["w", "d"]), law(0.1), late], inputs=["r", "d"], outputs=["y0", "y1", "u", "w"]
+        [plant(inputs=["w", "d"]), law(period), late], inputs=["r", "d"], outputs=["y0", "y1", "u", "w"]
     )
     times = times_of(0.9, 10, 0.1, 0.34, 0.4)
-    block = law_by_hand(0.1, 0.0, lambda x, read: [read(planned), x[0]])
+    block = law_by_hand(period, 0.0, lambda x, read: [read(planned), x[0]])
     expected = oracle.run(A, B, None, [[(0, delay)], [(planned, 0)]], [block], [planned], [0.3, -0.2], times)
     found = cp.simulate(loop, times, {"r": plan, "d": plan}, [0.3, -0.2, 0.0, 0.0, 0.0])
     assert found.method == "exact"
@@ -159,23 +169,23 @@ def test_a_control_that_comes_late(delay):
     assert worst(found.outputs[3], [past]) <= 1e-12
 
 
-@pytest.mark.parametrize("delay", [0.34, 0.3, 0.04, 0.1])
-def test_a_measurement_that_comes_late(delay):
-    """The law reads the position of 3.4, 3, 0.4 and 1 periods ago, sampled then."""
+@pytest.mark.parametrize(("period", "delay"), DELAYS)
+def test_a_measurement_that_comes_late(period, delay):
+    """The law reads the position of some time ago, sampled then."""
     plan, planned = plan_and_oracle()
     late = cp.create_delay_iosystem(delay, inputs="y0", outputs="w", initial=0.25)
     loop = ct.interconnect(
-        [plant(), law(0.1, inputs=["r", "w"]), late], inputs=["r", "d"], outputs=["y0", "y1", "u", "w"]
+        [plant(), law(period, inputs=["r", "w"]), late], inputs=["r", "d"], outputs=["y0", "y1", "u", "w"]
     )
     times = times_of(0.9, 10, 0.1, 0.34, 0.4)
-    offset = float((1 - Fraction(str(delay))) % Fraction(1, 10))
-    seen = Held(0.1, offset, [], [], [], [[1.0]], lambda x, read: [x[0]])
+    offset = float((1 - Fraction(str(delay))) % Fraction(str(period)))
+    seen = Held(period, offset, [], [], [], [[1.0]], lambda x, read: [x[0]])
 
     def inputs(x, read):
         past = read.__defaults__[1] - exact(delay)
         return [read(planned), seen.at(past) if past >= -oracle.NEAR else 0.25]
 
-    blocks = [seen, law_by_hand(0.1, 0.0, inputs)]
+    blocks = [seen, law_by_hand(period, 0.0, inputs)]
     expected = oracle.run(A, B, None, [[(1, 0)], [(planned, 0)]], blocks, [planned], [0.3, -0.2], times)
     found = cp.simulate(loop, times, {"r": plan, "d": plan}, [0.3, -0.2, 0.0, 0.0, 0.0])
     assert found.method == "exact"
