@@ -56,8 +56,7 @@ from ctrlplan.systems import plants
 from ctrlplan.systems.admissible import AdmissibleSet
 from ctrlplan.systems.command_filter import command_filter_gains, command_lead, create_command_filter_iosystem
 from ctrlplan.systems.exposed import expose_states, state_signals
-from ctrlplan.systems.feedforward import create_feedforward_iosystem
-from ctrlplan.systems.feedforward_block import PlannedFeedforward
+from ctrlplan.systems.feedforward import PlannedFeedforward, create_feedforward_iosystem
 from ctrlplan.systems.feedforward_fit import FeedforwardFit, fit_feedforward
 from ctrlplan.systems.flat import create_flat_iosystem
 from ctrlplan.systems.flat_feedforward import create_flat_feedforward_iosystem, reference_window

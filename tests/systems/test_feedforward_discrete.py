@@ -422,7 +422,7 @@ def test_a_loop_without_a_sampling_time():
 
 def test_matrices_of_a_sampled_loop():
     """The sampled loop against the exact discretisation, written out."""
-    from ctrlplan.systems.feedforward_sampled import _sampled_loop
+    from ctrlplan.systems.feedforward.sampled import _sampled_loop
 
     found = _sampled_loop(loop_of([1], [1, 1, 0])).loop
     a, b = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[1.0], [0.0]])

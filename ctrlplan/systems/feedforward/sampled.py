@@ -10,10 +10,10 @@ import numpy as np
 from scipy.linalg import block_diag, expm
 
 from ctrlplan._types import Array, System
-from ctrlplan.systems.feedforward_block import PlannedFeedforward
-from ctrlplan.systems.feedforward_discrete import DiscreteCommand, discrete_command
-from ctrlplan.systems.feedforward_planned import PlanOptions
-from ctrlplan.systems.feedforward_zeros import eigenvalues
+from ctrlplan.systems.feedforward.block import PlannedFeedforward
+from ctrlplan.systems.feedforward.discrete import DiscreteCommand, discrete_command
+from ctrlplan.systems.feedforward.planned import PlanOptions
+from ctrlplan.systems.feedforward.zeros import eigenvalues
 from ctrlplan.systems.hybrid import SampleHold, sample_hold
 from ctrlplan.systems.source import PlanSource
 from ctrlplan.traits import declare, traits_of

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ctrlplan._display import Displayed, Facts, Part, number
 from ctrlplan._types import Array, System
-from ctrlplan.systems.feedforward_zeros import zero_list
+from ctrlplan.systems.feedforward.zeros import zero_list
 from ctrlplan.traits import declare
 
 

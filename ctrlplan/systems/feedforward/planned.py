@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
-from ctrlplan.systems.feedforward_block import Accuracy, PlannedFeedforward
-from ctrlplan.systems.feedforward_inverse import Inverse, loop_inverse
-from ctrlplan.systems.feedforward_preview import continuous_motion, preview_of
-from ctrlplan.systems.feedforward_states import Dynamics, unstable_states
-from ctrlplan.systems.feedforward_zeros import (
+from ctrlplan.systems.feedforward.block import Accuracy, PlannedFeedforward
+from ctrlplan.systems.feedforward.inverse import Inverse, loop_inverse
+from ctrlplan.systems.feedforward.preview import continuous_motion, preview_of
+from ctrlplan.systems.feedforward.states import Dynamics, unstable_states
+from ctrlplan.systems.feedforward.zeros import (
     Boundary,
     ComplexArray,
     Separation,

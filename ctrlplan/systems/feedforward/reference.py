@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
-from ctrlplan.systems.feedforward_zeros import ComplexArray
+from ctrlplan.systems.feedforward.zeros import ComplexArray
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.internal import InternalTrajectory
 

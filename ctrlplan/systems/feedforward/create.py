@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from ctrlplan._checks import check_kind, checked_finite, checked_labels, checked_names
 from ctrlplan._renamed import former_signature
 from ctrlplan._types import Array, System
-from ctrlplan.systems.feedforward_block import PlannedFeedforward
-from ctrlplan.systems.feedforward_discrete import discrete_feedforward
-from ctrlplan.systems.feedforward_inverse import loop_inverse
-from ctrlplan.systems.feedforward_planned import PlanOptions, planned_feedforward
-from ctrlplan.systems.feedforward_sampled import is_sampled, sampled_feedforward
-from ctrlplan.systems.feedforward_zeros import eigenvalues, largest_size, tolerance, zero_list
+from ctrlplan.systems.feedforward.block import PlannedFeedforward
+from ctrlplan.systems.feedforward.discrete import discrete_feedforward
+from ctrlplan.systems.feedforward.inverse import loop_inverse
+from ctrlplan.systems.feedforward.planned import PlanOptions, planned_feedforward
+from ctrlplan.systems.feedforward.sampled import is_sampled, sampled_feedforward
+from ctrlplan.systems.feedforward.zeros import eigenvalues, largest_size, tolerance, zero_list
 from ctrlplan.trajectories import Trajectory, derivative_name
 
 

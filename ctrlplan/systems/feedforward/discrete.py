@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
-from ctrlplan.systems.feedforward_block import Accuracy, PlannedFeedforward
-from ctrlplan.systems.feedforward_inverse import Inverse, loop_inverse
-from ctrlplan.systems.feedforward_planned import (
+from ctrlplan.systems.feedforward.block import Accuracy, PlannedFeedforward
+from ctrlplan.systems.feedforward.inverse import Inverse, loop_inverse
+from ctrlplan.systems.feedforward.planned import (
     PlanOptions,
     Remainder,
     Start,
@@ -22,9 +22,9 @@ from ctrlplan.systems.feedforward_planned import (
     motion_left,
     oscillations,
 )
-from ctrlplan.systems.feedforward_preview import discrete_motion, preview_of
-from ctrlplan.systems.feedforward_reference import MAXIMUM, Reference, held_samples
-from ctrlplan.systems.feedforward_zeros import (
+from ctrlplan.systems.feedforward.preview import discrete_motion, preview_of
+from ctrlplan.systems.feedforward.reference import MAXIMUM, Reference, held_samples
+from ctrlplan.systems.feedforward.zeros import (
     Boundary,
     ComplexArray,
     Separation,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from ctrlplan._types import Array
-from ctrlplan.systems.feedforward_inverse import first_columns
+from ctrlplan.systems.feedforward.inverse import first_columns
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import FACTORIALS
 from ctrlplan.trajectories.internal import InternalTrajectory

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from ctrlplan._types import Array
-from ctrlplan.systems.feedforward_zeros import ComplexArray, eigenvalues, zero_list
+from ctrlplan.systems.feedforward.zeros import ComplexArray, eigenvalues, zero_list
 from ctrlplan.trajectories import Trajectory
 
 _STEP = 0.02
