@@ -237,7 +237,7 @@ LOOPS = {
 def test_closed_loops_are_chains_of_integrators(plant, poles, error):
     naxes, order = len(poles), len(poles[0])
     plan = smooth(order, naxes)
-    loop = closed(plan, create_flat_iosystem(plant, poles), plant, order)
+    loop = closed(plan, create_flat_iosystem(plant, poles, labels=plan.labels), plant, order)
     t = np.linspace(0.0, 4.0, 31)
     start = error * np.cos(np.arange(naxes * order)).reshape(naxes, order)
     flag = [np.append(plan.jet(0.0, order - 1)[:, i] + start[i], 0.0) for i in range(naxes)]
