@@ -258,7 +258,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
 
     @cached_property
     def pace_degrees(self) -> tuple[int, ...]:
-        """Powers of the pace to which the inputs are proportional; empty if they do not set it."""
+        """Powers of the pace in the inputs; empty if they do not set it."""
         try:
             points = self._points()
         except ValueError:  # no point is known at which the maps are finite
@@ -301,7 +301,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         return found if known else {name: found[name] for name in self.state_labels}
 
     def signals(self, x: Array, u: Array) -> dict[str, Array]:
-        """States (nstates, ...), inputs (ninputs, ...) and what depends on them, by name."""
+        """Signals by name from states and inputs, (n, ...) each."""
         return dict(zip([*self.state_labels, *self.input_labels], [*x, *u], strict=True))
 
     def _checked_jet(self, jet: ArrayLike) -> tuple[Array, bool]:
