@@ -190,7 +190,10 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         plan : Trajectory
             Plan of the flat outputs, assigned by name if its labels are those of
             the flat outputs, or in order if its labels are the defaults. Before
-            its start and after its end the positions are constant.
+            its start and after its end the positions are constant. A vehicle that
+            stops requires a `PathPlan`, of which the states are continuous and the
+            inputs finite at the stops; its forward direction is that of the maps by
+            formulas, or of the operating point.
         timepts : array_like, any shape
             Times [s], in any order.
         start : array_like, shape (nstates,), optional
@@ -212,7 +215,9 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         ValueError
             If the plan's labels are not those of the flat outputs, a derivative
             below r_j jumps between the times, `start` has a wrong shape, or the
-            maps are singular. The message states the signal and the time.
+            maps are singular. The message states the signal and the time. If `plan`
+            is a `PathPlan` and the rates of the plant are not proportional to some
+            of its inputs, or states differ where its segments join.
         """
         plan, times = self._along(plan, timepts, start)
         given = None if start is None else finite_vector(start, "start", str(self.nstates))

@@ -196,7 +196,7 @@ def fastest(
         starts or ends in motion, the speed there is free. A plan that is closed and
         in motion at its ends remains closed. Stops and dwells remain, dwells with
         their duration. If accelerations are limited, the plan stops at corners of
-        the path.
+        the path. The segments of a `PathPlan` get a time law each.
     durations : (float, float), optional
         Interval of durations [s] of the search. Default: from 1/64 of the minimum
         that was found (of the plan's duration for "waypoints") to 64 times the
@@ -267,6 +267,12 @@ def fastest(
     average within 0.5 % of a limit, so that the duration is at most about 0.3 %
     above the time-optimal one; the acceleration is continuous. No cell of the path
     violates a limit.
+
+    The states and inputs of a vehicle along a `PathPlan` are evaluated through the path
+    parameter s. There a limited signal is c(s) + g(s) s', as the speed, the steering
+    rate and the rate of the heading, or c(s) + A(s) s'^2 + B(s) s'', as the rate of the
+    speed. Limits of the first kind bound b and those of the second one are linear in
+    b, so that the time laws are the fastest ones up to the same 0.3 %.
 
     With fixed path and other limits (derivatives of order 3 and higher, quantities)
     the rate is a spline with 16 knots in the time of the given plan, not along its
