@@ -391,8 +391,8 @@ def _scaled_by_orders(
             f"limits must be satisfied for some duration from {searched[0]:.4g} to {searched[1]:.4g} s, got a minimum "
             f"of {duration:.6g} s"
         )
-    feasible = ((duration, searched[1]),)
-    return Fastest(plan.retime(duration), found, feasible, "path", limited, searched=searched)
+    fast = plan.retime(duration)
+    return Fastest(fast, found, ((fast.duration, searched[1]),), "path", limited, searched=searched)
 
 
 def _moves(plan: Trajectory) -> bool:
