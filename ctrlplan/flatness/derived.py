@@ -201,7 +201,7 @@ class DerivedFlatSystem(FlatSystem):
         return {name: row.reshape(trailing) for name, row in found.items()}
 
     def signals(self, x: Array, u: Array) -> dict[str, Array]:
-        """States (nstates, n), inputs (ninputs, n) and outputs, by name."""
+        """States, inputs and outputs by name; see `FlatSystem`."""
         p = self.parameter_values()
         # Another branch of operations that are not smooth: not determined by the maps.
         u = np.where(on_branch(self.maps, x, u, p), u, np.nan)

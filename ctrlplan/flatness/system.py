@@ -190,7 +190,10 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         plan : Trajectory
             Plan of the flat outputs, assigned by name if its labels are those of
             the flat outputs, or in order if its labels are the defaults. Before
-            its start and after its end the positions are constant.
+            its start and after its end the positions are constant. A vehicle that
+            stops requires a `PathPlan`, of which the states are continuous and the
+            inputs finite at the stops; its forward direction is that of the maps by
+            formulas, or of the operating point.
         timepts : array_like, any shape
             Times [s], in any order.
         start : array_like, shape (nstates,), optional
@@ -212,7 +215,9 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         ValueError
             If the plan's labels are not those of the flat outputs, a derivative
             below r_j jumps between the times, `start` has a wrong shape, or the
-            maps are singular. The message states the signal and the time.
+            maps are singular. The message states the signal and the time. If `plan`
+            is a `PathPlan` and the rates of the plant are not proportional to some
+            of its inputs, or states differ where its segments join.
         """
         plan, times = self._along(plan, timepts, start)
         given = None if start is None else finite_vector(start, "start", str(self.nstates))
@@ -258,7 +263,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
 
     @cached_property
     def pace_degrees(self) -> tuple[int, ...]:
-        """Powers of the pace to which the inputs are proportional; empty if they do not set it."""
+        """Powers of the pace in the inputs; empty if they do not set it."""
         try:
             points = self._points()
         except ValueError:  # no point is known at which the maps are finite
@@ -301,7 +306,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         return found if known else {name: found[name] for name in self.state_labels}
 
     def signals(self, x: Array, u: Array) -> dict[str, Array]:
-        """States (nstates, ...), inputs (ninputs, ...) and what depends on them, by name."""
+        """Signals by name from states and inputs, (n, ...) each."""
         return dict(zip([*self.state_labels, *self.input_labels], [*x, *u], strict=True))
 
     def _checked_jet(self, jet: ArrayLike) -> tuple[Array, bool]:

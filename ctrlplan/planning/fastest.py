@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Literal, NoReturn, get_args
@@ -19,6 +19,7 @@ from ctrlplan.planning.durations import PlansByDuration, ReplannedPlans
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
 from ctrlplan.planning.path_law import fastest_law
+from ctrlplan.planning.path_law.vehicle import fastest_segment_law, orders_on_path
 from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, bottom, scan
 from ctrlplan.planning.time_law import with_fast_time_law
@@ -50,6 +51,9 @@ _NEAR = 1e-8
 
 _ROUNDING = 1e-14
 """The same by exact responses."""
+
+_RESOLVED = 1e-10
+"""Increase of a duration by which limits that are violated by rounding are satisfied, relative to it."""
 
 _ABOVE = 1.0 + 1e-14
 """Duration on a path relative to that by its extrema, which are known up to rounding."""
@@ -192,7 +196,7 @@ def fastest(
         starts or ends in motion, the speed there is free. A plan that is closed and
         in motion at its ends remains closed. Stops and dwells remain, dwells with
         their duration. If accelerations are limited, the plan stops at corners of
-        the path.
+        the path. The segments of a `PathPlan` get a time law each.
     durations : (float, float), optional
         Interval of durations [s] of the search. Default: from 1/64 of the minimum
         that was found (of the plan's duration for "waypoints") to 64 times the
@@ -263,6 +267,12 @@ def fastest(
     average within 0.5 % of a limit, so that the duration is at most about 0.3 %
     above the time-optimal one; the acceleration is continuous. No cell of the path
     violates a limit.
+
+    The states and inputs of a vehicle along a `PathPlan` are evaluated through the path
+    parameter s. There a limited signal is c(s) + g(s) s', as the speed, the steering
+    rate and the rate of the heading, or c(s) + A(s) s'^2 + B(s) s'', as the rate of the
+    speed. Limits of the first kind bound b and those of the second one are linear in
+    b, so that the time laws are the fastest ones up to the same 0.3 %.
 
     With fixed path and other limits (derivatives of order 3 and higher, quantities)
     the rate is a spline with 16 knots in the time of the given plan, not along its
@@ -342,18 +352,47 @@ def fastest_under(
 
 def _fastest_between_stops(plan: PathPlan, limited: Limited, span: tuple[float, float] | None) -> Fastest:
     """Plan with a time law of minimum duration for each segment; the stops make them independent."""
-    uniform = fastest_within(plan, limited, span)
-    laws = []
-    scaled = plan.retime(uniform.duration)
+    limited.check_smooth(plan)
+    _check_rest(plan, limited)
+    orders = orders_on_path(plan, limited)
+    if orders is not None and not any(orders):
+        raise ValueError("limits must include one that a shorter plan would violate, got none")
+    scaled = plan if orders is not None else plan.retime(fastest_within(plan, limited, span).duration)
+    laws: list[Trajectory] = []
     for curve, direction, law in zip(plan.segments, plan.directions, scaled.laws, strict=True):
         # The values of the time law are times: relative to the start they have full precision.
-        begun = law.shift(-law.start)
-        part = PathPlan([curve], [direction], begun, labels=plan.labels)
+        part = PathPlan([curve], [direction], law.shift(-law.start), labels=plan.labels)
         own = limited.of(part)
-        laws.append(Retimed(begun, with_fast_time_law(own.seen(part), own).law))
-    retimed = fastest_within(plan.with_laws(laws), limited, span)
-    found = min(retimed, uniform, key=lambda found: found.duration)
-    return replace(found, hold="path")
+        if orders is not None:
+            laws.append(fastest_segment_law(part, own, orders))
+        else:
+            laws.append(Retimed(part.laws[0], with_fast_time_law(own.seen(part), own).law))
+    fast = plan.with_laws(laws).shift(plan.start - laws[0].start)
+    if orders is None:
+        return replace(fastest_within(fast, limited, span), hold="path")
+    return _scaled_by_orders(fast, limited, orders, span)
+
+
+def _scaled_by_orders(
+    plan: PathPlan, limited: Limited, orders: Sequence[int], span: tuple[float, float] | None
+) -> Fastest:
+    """Plan of minimum duration with fixed shape, for signals that are proportional to powers of the pace."""
+    order_of = list(zip(limited.bounds, orders, strict=True))
+    rows = [(row, order) for row in limited.margins(plan) for bound, order in order_of if row.of(bound) and order]
+    searched = span or (0.0, math.inf)
+    duration = plan.duration * max((1.0 - row.fraction) ** (1.0 / order) for row, order in rows) * _ABOVE
+    duration = max(duration, searched[0])
+    found = limited.margins(plan.retime(duration))
+    while found.active.fraction < 0.0:  # by rounding, or of a signal with a constant part
+        duration *= 1.0 + min(-found.active.fraction, 1.0) + _RESOLVED
+        found = limited.margins(plan.retime(duration))
+    if duration > searched[1]:
+        raise ValueError(
+            f"limits must be satisfied for some duration from {searched[0]:.4g} to {searched[1]:.4g} s, got a minimum "
+            f"of {duration:.6g} s"
+        )
+    fast = plan.retime(duration)
+    return Fastest(fast, found, ((fast.duration, searched[1]),), "path", limited, searched=searched)
 
 
 def _moves(plan: Trajectory) -> bool:

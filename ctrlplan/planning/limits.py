@@ -196,7 +196,8 @@ def margins(
         maps a jet (order + 1, naxes, ntime) to a mapping of names to signals
         (ntime,), or a loop (outputs and inputs; see `loop_quantities`).
         Quantities that the plan does not determine at rest (heading and steering
-        angle of a car) are nan there and rejected.
+        angle of a car) are nan there and rejected; along a `PathPlan` they are
+        determined.
     tail : float, optional
         Time after the plan [s] for which a loop that is sampled or nonlinear is
         simulated; default: the duration of the plan. Signals of other loops are

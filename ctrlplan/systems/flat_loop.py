@@ -223,7 +223,8 @@ def flat_loop(
     flat : FlatSystem
         The plant.
     plan : Trajectory
-        Plan of the flat outputs.
+        Plan of the flat outputs; for a vehicle that stops a `PathPlan`, with the laws
+        Feedforward and TVLQR.
     poles : sequence of sequences of complex, optional
         Short form of ``law=FlatLaw(poles)``.
     law : FlatLaw, Feedforward or TVLQR, optional

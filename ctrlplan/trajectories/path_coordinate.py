@@ -130,6 +130,23 @@ class _Coordinate(InternalTrajectory):
         found[0] += self.pieces.offsets[self.pieces.number(k, piece)]
         return found
 
+    @property
+    def in_batches(self) -> bool:
+        """Whether segments are evaluated together, as those of a part are."""
+        return any(part.in_batches for part in self.parts)
+
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""
+        found, first = np.empty((order + 1, 1, s.size)), 0
+        for k, part in enumerate(self.parts):
+            last = first + part.breakpoints.size - 1
+            own = np.flatnonzero((segments >= first) & (segments < last))
+            inner, pieces = part.laws_jet(segments[own] - first, s[own], order)
+            found[:, :, own] = inner
+            found[0, 0, own] += self.pieces.offsets[self.pieces.number(k, 0) + pieces]
+            first = last
+        return found
+
     def map_time(self, origin: float, target: float, rate: float) -> Self:
         """Same path at other times; as `Trajectory.map_time`."""
         return type(self)([part.map_time(origin, target, rate) for part in self.parts], self.pieces)

@@ -137,7 +137,7 @@ class PathPlan(Joined):
 
     @property
     def stops(self) -> tuple[float, ...]:
-        """Times [s] of the start, of the ends of inner segments, and of the end."""
+        """Times [s] of the start and of the end of each segment."""
         return (self.start, *(part.end for part in self.parts))
 
     @cached_property
@@ -147,12 +147,12 @@ class PathPlan(Joined):
 
     @cached_property
     def coordinate(self) -> Trajectory:
-        """The path parameter over time, shifted piece by piece as `Pieces` says."""
+        """Path parameter over time, shifted as `Pieces` says."""
         return path_coordinate(self.parts, self.pieces)
 
     @cached_property
     def with_coordinate(self) -> Trajectory:
-        """The plan with `coordinate` as a third axis, for functions of the jet of both."""
+        """The plan with `coordinate` as a third axis."""
         return with_coordinate(self, self.coordinate)
 
     def path_jet(self, t: ArrayLike, order: int, left: bool = False) -> tuple[Array, Array]:

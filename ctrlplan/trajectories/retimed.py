@@ -120,22 +120,34 @@ class Retimed(Trajectory):
 
     def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
         """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""
-        of_law, of_plan = self._of_segments[:, segments]
-        since = self.breakpoints[segments] - self.law.breakpoints[of_law]
-        inner = self.law.segments_jet(of_law, s + since, order)
-        elapsed = inner[0, 0] - self.plan.breakpoints[of_plan]
-        return _composed_jets(self.plan.segments_jet(of_plan, elapsed, order), inner)
+        inner, of_plan = self.laws_jet(segments, s, order)
+        return _composed_jets(self.plan.segments_jet(of_plan, self._elapsed(inner[0, 0], of_plan), order), inner)
 
     def law_jet(self, segment: int, s: Array, order: int) -> tuple[Array, int]:
-        """Derivatives (order + 1, 1, ntime) of the law in a segment, and the number of the plan's segment there."""
+        """Derivatives of the law in a segment, and the plan's segment."""
         of_law, of_plan = self._of_segments[:, segment].tolist()
         return self.law.segment_jet(of_law, s + self._since(segment), order), of_plan
+
+    def laws_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> tuple[Array, NDArray[np.intp]]:
+        """As `law_jet`, each time in its own segment."""
+        of_law, of_plan = self._of_segments[:, segments]
+        since = self.breakpoints[segments] - self.law.breakpoints[of_law]
+        return self.law.segments_jet(of_law, s + since, order), of_plan
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         inner, of_plan = self.law_jet(segment, s, order)
-        elapsed = inner[0, 0] - self.plan.breakpoints[of_plan]
-        return _composed_jets(self.plan.segment_jet(of_plan, elapsed, order), inner)
+        return _composed_jets(self.plan.segment_jet(of_plan, self._elapsed(inner[0, 0], of_plan), order), inner)
+
+    def _elapsed(self, time: Array, of_plan: NDArray[np.intp] | int) -> Array:
+        """Times since the starts of segments of the plan, within them up to more than rounding.
+
+        Beyond its end a plan that is at rest there would move back, by rounding times the rate.
+        """
+        begins, ends = self.plan.breakpoints[of_plan], self.plan.breakpoints[np.asarray(of_plan) + 1]
+        elapsed = time - begins
+        inside = np.clip(elapsed, 0.0, ends - begins)
+        return np.where(np.abs(elapsed - inside) <= _ROUNDING * (ends - begins), inside, elapsed)
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""

@@ -86,26 +86,60 @@ def test_with_fixed_shape_the_duration_is_that_of_the_powers_of_time():
 
 @pytest.mark.parametrize(
     ("limits", "system"),
-    [
-        ({"velocity": 2.0, "acceleration": 1.0}, None),
-        pytest.param({"v": cp.Limits(-2.0, 2.0, rate=1.0)}, FLAT, marks=pytest.mark.slow),
-    ],
+    [({"velocity": 2.0, "acceleration": 1.0}, None), ({"v": cp.Limits(-2.0, 2.0, rate=1.0)}, FLAT)],
     ids=["axes", "car"],
 )
 def test_each_segment_has_the_fastest_time_law(limits, system):
     """On a straight line: a trapezoid of the speed, of duration L/V + V/A."""
-    found = cp.fastest(STRAIGHT, limits, system, hold="path")
+    found = cp.fastest(STRAIGHT.shift(3.0), limits, system, hold="path")
     assert isinstance(found.plan, cp.PathPlan)
-    best = [12.0 / 2.0 + 2.0, 6.0 / 2.0 + 2.0]
+    assert found.plan.start == 3.0
+    best = np.array([12.0 / 2.0 + 2.0, 6.0 / 2.0 + 2.0])
     got = np.diff(found.plan.stops)
-    assert (got >= np.array(best) * (1.0 - 1e-9)).all()
-    assert (got <= 1.1 * np.array(best)).all()
-    t = np.linspace(0.0, found.duration, 2001)
-    _, speed, _, _ = expected(found.plan, t)
-    assert np.abs(speed).max() <= 2.0 * (1.0 + 1e-9)
+    assert (got >= best * (1.0 - 1e-9)).all()
+    assert (got <= best * 1.001).all()
+    t = np.linspace(3.0, found.plan.end, 2001)
+    assert np.abs(expected(found.plan, t)[1]).max() <= 2.0 * (1.0 + 1e-9)
     assert np.abs(found.plan(t, 2)).max() <= 1.0 + 1e-9
     assert found.margins.satisfied
     assert "fixed path" in repr(found)
+
+
+def duration_at(fastest):
+    """Duration with the fastest possible rate at each point of the path, by a fine sum: without accelerations."""
+    total = 0.0
+    for segment, direction in zip(PLAN.segments, PLAN.directions, strict=True):
+        unit = cp.PathPlan([segment], [direction], law(1.0))
+        t = (np.arange(20000) + 0.5) / 20000
+        _, speed, delta, rate = expected(unit, t)
+        ds = unit.laws[0](t, 1)
+        total += np.mean(ds / fastest(direction, speed / ds, delta, rate / ds))
+    return total
+
+
+REGION = cp.Region(("v", "delta"), [(2, 0), (0.5, 0.9), (-0.5, 0.9), (-2, 0), (-0.5, -0.9), (0.5, -0.9)])
+
+
+@pytest.mark.parametrize(
+    ("limits", "fastest"),
+    [
+        (
+            {"v": (-1.0, 2.0), "delta": cp.Limits(-0.9, 0.9, rate=0.5)},
+            lambda way, v, delta, rate: np.minimum((2.0 if way > 0 else 1.0) / abs(v), 0.5 / np.abs(rate)),
+        ),
+        pytest.param(
+            {"narrow": REGION},
+            lambda way, v, delta, rate: (2.0 - 1.5 * np.abs(delta) / 0.9) / np.abs(v),
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["speed, steering angle and steering rate", "region"],
+)
+def test_without_limits_of_accelerations_a_limit_is_active_everywhere(limits, fastest):
+    found = cp.fastest(PLAN, limits, FLAT, hold="path")
+    best = duration_at(fastest)
+    assert best * (1.0 - 1e-6) <= found.duration <= 1.003 * best
+    assert found.margins.satisfied
 
 
 @pytest.mark.slow
@@ -123,6 +157,27 @@ def test_the_fastest_parking_manoeuvre():
     drawn = found.plot()
     assert drawn.axes.shape == (4, 1)
     plt.close(drawn.figure)
+
+
+def test_durations_that_are_given():
+    limits = {"velocity": 2.0, "acceleration": 1.0}
+    longer = cp.fastest(STRAIGHT, limits, hold="path", durations=(20.0, 30.0))
+    assert longer.duration == pytest.approx(20.0)
+    assert longer.feasible == ((longer.duration, 30.0),)
+    with pytest.raises(ValueError, match=r"for some duration from 5 to 12 s, got a minimum of 13\.00"):
+        cp.fastest(STRAIGHT, limits, hold="path", durations=(5.0, 12.0))
+    with pytest.raises(ValueError, match="limits must include one that a shorter plan would violate, got none"):
+        cp.fastest(PLAN, {"delta": 1.0}, FLAT, hold="path")
+
+
+@pytest.mark.slow
+def test_limits_that_are_not_convex_have_a_smooth_time_law():
+    """A jerk: not the fastest law, but one that satisfies all limits; shorter than the plan of fixed shape."""
+    limits = {"v": 2.0, "jerk": 2.0}
+    found, shape = (cp.fastest(STRAIGHT, limits, FLAT, hold=hold) for hold in ("path", "shape"))
+    assert isinstance(found.plan, cp.PathPlan)
+    assert found.margins.satisfied
+    assert found.duration < 0.99 * shape.duration
 
 
 def test_a_curve_that_is_too_narrow_is_named_at_its_place():
@@ -163,3 +218,6 @@ def test_limits_of_derivatives_need_no_vehicle():
         wanted = max(size, 0.0 if system is None else np.hypot(*PLAN(DENSE, 1)).max() / np.sqrt(1.5))
         assert found.duration == pytest.approx(PLAN.duration * wanted, rel=1e-5)
         assert isinstance(found.plan, cp.PathPlan)
+        faster = cp.fastest(PLAN, limits, system, hold="path")
+        assert faster.margins.satisfied
+        assert faster.duration < found.duration

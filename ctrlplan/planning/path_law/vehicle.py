@@ -1,0 +1,169 @@
+r"""Fastest time law of a segment of a `PathPlan`, under limits of a vehicle.
+
+With the rate r and the acceleration a of the path parameter, r = ds/dt and
+a = d^2s/dt^2, limited signals have one of the forms
+
+.. math:: c(s) + g(s)\,r, \qquad c(s) + A(s)\,r^2 + B(s)\,a
+
+(speeds, steering rates and angles; rates of speeds, accelerations along and across the
+path). The first ones limit the rate from above, the second ones are linear in the
+squared rate, so that `fastest_law` applies. The segment is first given a cubic time law,
+which is at rest at both ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ctrlplan.planning.bounds import Bound, Limits, Signal
+from ctrlplan.planning.path_law.law import fastest_law
+from ctrlplan.trajectories import PathPlan, PolySpline, Retimed, Trajectory, Waypoint
+from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.internal import InternalTrajectory
+
+if TYPE_CHECKING:
+    from ctrlplan.planning.limits import Limited
+
+_SAME = 1e-9
+"""Size of a coefficient, relative to the largest one of a signal, that is rounding."""
+
+_TESTED = (0.7, -0.4)
+"""Rate and acceleration at which the forms are compared with the signals."""
+
+
+def orders_on_path(plan: PathPlan, limited: Limited) -> list[int] | None:
+    """Order of each limited signal in time: 1 for the first form, 2 for the second; 0 if it is no function of time.
+
+    Returns
+    -------
+    list of int, or None
+        None if a signal has neither form.
+    """
+    if limited.order > 2 or limited.loop_bounds:
+        return None
+    times = np.concatenate([a + (b - a) * np.array([0.13, 0.5, 0.81]) for a, b in _intervals(plan)])
+    try:
+        forms = _Forms(plan, limited).at(*plan.coordinate.jet(times, 0)[0])
+        wanted = _Forms(plan, limited).values(plan.coordinate.jet(times, 0)[0, 0], *_TESTED)
+    except ValueError:  # not determined along the path
+        return None
+    sizes = np.stack([np.abs(form).max(axis=1) for form in forms])
+    small = sizes <= _SAME * sizes.max(axis=0)
+    r, a = _TESTED
+    found = forms[0] + forms[1] * r + forms[2] * r**2 + forms[3] * a
+    if not (np.abs(found - wanted).max(axis=1) <= _SAME * (sizes.max(axis=0) + np.abs(wanted).max(axis=1))).all():
+        return None
+    paced, accelerated = small[2] & small[3], small[1]
+    if not (paced | accelerated).all():
+        return None
+    return [0 if still and one else 1 if one else 2 for one, still in zip(paced, accelerated, strict=True)]
+
+
+def fastest_segment_law(part: PathPlan, limited: Limited, orders: Sequence[int]) -> Trajectory:
+    """Time law of minimum duration of a path of one segment, from rest to rest, at points of its cells.
+
+    Parameters
+    ----------
+    part : PathPlan
+        Path of one segment.
+    limited : Limited
+        Limits for this path, satisfied at rest.
+    orders : sequence of int
+        Of the limited signals, from `orders_on_path`.
+    """
+    (curve,) = part.segments
+    base = PolySpline([Waypoint(0.0, curve.start, 0.0), Waypoint(1.0, curve.end, 0.0)], labels=["s"])
+    timed = part.with_laws([base])
+    forms = _Forms(timed, limited)
+    second = [k for k, order in enumerate(orders) if order == 2]
+    virtual = _Signals(timed, forms, second)
+    bounds = _over_time(partial(_fastest_rates, timed, forms), 0, 1) if 1 in orders else []
+    for axis, k in enumerate(second, 1):
+        bounds += _over_time(partial(_differences, timed, forms, k), axis, 2)
+    return Retimed(base, fastest_law(virtual, bounds, virtual.start).plan.law)
+
+
+def _intervals(plan: PathPlan) -> Array:
+    return np.stack([plan.breakpoints[:-1], plan.breakpoints[1:]], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Forms:
+    """Coefficients of limited signals along a path."""
+
+    plan: PathPlan
+    limited: Limited
+
+    def values(self, coordinate: Array, r: float, a: float) -> Array:
+        """Limited signals (nbounds, n) for a rate and an acceleration of the path parameter."""
+        numbers, s = self.plan.pieces.located(coordinate)
+        p = self.plan.pieces.jet(numbers, s, 2)
+        jet = np.stack([p[0], r * p[1], r**2 * p[2] + a * p[1]])
+        if self.limited.on_path:
+            own = np.stack([coordinate, np.full(s.size, r), np.full(s.size, a)])
+            jet = np.concatenate([jet, own[:, None]], axis=1)
+        return self.limited.values(jet[: self.limited.order + 1])
+
+    def at(self, coordinate: Array) -> tuple[Array, Array, Array, Array]:
+        """Coefficients c, g, A and B (nbounds, n) at values of the path coordinate (n,)."""
+        constant = self.values(coordinate, 0.0, 0.0)
+        once, twice, along = (self.values(coordinate, r, a) - constant for r, a in ((1.0, 0.0), (2.0, 0.0), (0.0, 1.0)))
+        square = 0.5 * twice - once
+        return constant, once - square, square, along
+
+
+class _Signals(InternalTrajectory):
+    """Path parameter, and axes whose first and second derivatives are those of limited signals of the second form."""
+
+    what = "a plan of limited signals"
+
+    def __init__(self, timed: PathPlan, forms: _Forms, second: Sequence[int]) -> None:
+        labels = ("s", *(f"signal{k}" for k in second))
+        self._set_fields(labels=labels, breakpoints=timed.breakpoints, _timed=timed, _forms=forms, _second=list(second))
+
+    _timed: PathPlan
+    _forms: _Forms
+    _second: list[int]
+
+    def segment_jet(self, segment: int, s: Array, order: int) -> Array:
+        """Derivatives of a segment up to the second one; as `Trajectory.segment_jet`."""
+        path = self._timed.coordinate.segment_jet(segment, s, 2)[:, 0]
+        found = np.zeros((3, self.naxes, s.size))
+        found[:, 0] = path
+        _, _, square, along = (form[self._second] for form in self._forms.at(path[0]))
+        found[1, 1:] = along * path[1]
+        found[2, 1:] = square * path[1] ** 2 + along * path[2]
+        return found[: order + 1]
+
+
+def _over_time(sides: Callable[[Array], tuple[Array, Array]], axis: int, order: int) -> list[Bound]:
+    """Limits of a derivative of an axis, as functions of time."""
+    signal = Signal(f"signal{axis}", order, axis)
+    limits = Limits(low=lambda times: sides(times)[0], high=lambda times: sides(times)[1])
+    return list(limits.bounds(signal.name, signal))
+
+
+def _fastest_rates(timed: PathPlan, forms: _Forms, times: Array) -> tuple[Array, Array]:
+    """Limits of ds/dt by the signals of the first form."""
+    constant, slope, square, along = forms.at(timed.coordinate.jet(times, 0)[0, 0])
+    low, high = (np.array([[getattr(b, side)] for b in forms.limited.bounds]) for side in ("low", "high"))
+    size = np.abs(slope).max(axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = np.where(slope > 0.0, high - constant, low - constant) / slope
+    matters = (np.abs(slope) > 1e-12 * size) & (np.abs(square) + np.abs(along) <= _SAME * size)
+    fastest = np.where(matters, room, np.inf).min(axis=0)
+    # Above 0 also where a signal reaches its limit at rest.
+    fastest = np.maximum(fastest, _SAME * fastest[np.isfinite(fastest)].max(initial=0.0))
+    return -fastest, fastest
+
+
+def _differences(timed: PathPlan, forms: _Forms, k: int, times: Array) -> tuple[Array, Array]:
+    """Limits of a signal of the second form without its constant."""
+    constant = forms.at(timed.coordinate.jet(times, 0)[0, 0])[0][k]
+    bound = forms.limited.bounds[k]
+    return bound.low - constant, bound.high - constant
