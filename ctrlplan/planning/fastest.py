@@ -15,10 +15,12 @@ from scipy.optimize import brentq
 from ctrlplan._checks import checked_finite, checked_pair
 from ctrlplan._display import Displayed, Facts, Figure, Part
 from ctrlplan._renamed import FormerAttribute
+from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.durations import PlansByDuration, ReplannedPlans
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
-from ctrlplan.planning.path_law import fastest_law
+from ctrlplan.planning.path_law import FastLaw, Rates, fastest_law
+from ctrlplan.planning.path_law.positions import required_rate
 from ctrlplan.planning.path_law.vehicle import fastest_segment_law, orders_on_path
 from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, bottom, scan
@@ -57,6 +59,15 @@ _RESOLVED = 1e-10
 
 _ABOVE = 1.0 + 1e-14
 """Duration on a path relative to that by its extrema, which are known up to rounding."""
+
+_RESERVES = (1e-4, 3e-4, 1e-3, 3e-3)
+"""Distances from the limits with given speeds at the ends, relative to them, one after the other until limits hold."""
+
+_AT_ENDS = 1e-12
+"""Excess that is the rounding of a given speed at a limit."""
+
+Ends = Literal["free", "given"]
+"""Speeds at the ends of a plan with another time law."""
 
 Hold = Literal["shape", "waypoints", "path"]
 """Property of a plan that `fastest` preserves."""
@@ -172,6 +183,7 @@ def fastest(
     tail: float | None = None,
     resolution: float = 1e-3,
     params: Mapping[str, object] | None = None,
+    ends: Ends = "free",
     quantities: System | None = None,
 ) -> Fastest:
     """Plan of minimum duration under limits.
@@ -193,8 +205,10 @@ def fastest(
         of the waypoints are scaled, their prescribed derivatives are preserved,
         and the spline is rebuilt. "path": the geometric path; the time law of the
         returned `Retimed` is optimised. An end at rest remains at rest; if the plan
-        starts or ends in motion, the speed there is free. A plan that is closed and
-        in motion at its ends remains closed. Stops and dwells remain, dwells with
+        starts or ends in motion, the speed there is that of `ends`. A plan that is
+        closed and in motion at its ends remains closed. Limits over time (`Limits`
+        with during, along or functions) apply at the positions of the given plan at
+        these times. Stops and dwells remain, dwells with
         their duration. If accelerations are limited, the plan stops at corners of
         the path. The segments of a `PathPlan` get a time law each.
     durations : (float, float), optional
@@ -209,6 +223,9 @@ def fastest(
     params : mapping of str to float or (float, float), optional
         Values or ranges of parameters of `system`, as for `margins`: limits are
         satisfied for the worst ones.
+    ends : {"free", "given"}, optional
+        With hold="path" and limits of velocities and accelerations: speeds where the
+        plan starts or ends in motion, free, or those of the given plan.
     quantities : optional
         Deprecated name of `system`.
 
@@ -306,9 +323,13 @@ def fastest(
     span = None if durations is None else checked_pair(durations, "durations")
     if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
         raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
+    if ends not in get_args(Ends):
+        raise ValueError(f"ends must be one of {', '.join(get_args(Ends))}, got {ends!r}")
+    if ends != "free" and (hold != "path" or params):
+        raise ValueError(f'ends must be "free" unless hold is "path", without params, got {ends!r} with hold {hold!r}')
     spare, chosen = checked_finite(resolution, "resolution", above=0.0), system_given(system, quantities)
     if not params:
-        return fastest_under(plan, Limited(plan, limits, chosen, tail), hold, span, spare)
+        return fastest_under(plan, Limited(plan, limits, chosen, tail), hold, span, spare, ends)
     from ctrlplan.planning.parameters import Family
     from ctrlplan.planning.robust import fastest_over
 
@@ -321,7 +342,12 @@ def fastest(
 
 
 def fastest_under(
-    plan: Trajectory, limited: Limited, hold: Hold, span: tuple[float, float] | None, resolution: float
+    plan: Trajectory,
+    limited: Limited,
+    hold: Hold,
+    span: tuple[float, float] | None,
+    resolution: float,
+    ends: Ends = "free",
 ) -> Fastest:
     """Plan of minimum duration, for precomputed limits; arguments as for `fastest`."""
     if hold != "path":
@@ -333,13 +359,16 @@ def fastest_under(
     if hold == "waypoints":
         return _searched(ReplannedPlans(plan, limited), span, hold, endless=False)
     if hold == "path":
+        if limited.derivatives_only and limited.order <= 2 and not isinstance(plan, PathPlan):
+            return _fastest_on_path(plan, limited, span, ends)
+        if ends != "free":
+            raise ValueError(
+                f'ends must be "free" with limits of quantities or of derivatives of order 3 and higher, got {ends!r}'
+            )
         limited.check_constant('limits with hold="path"')
-        if isinstance(plan, PathPlan):
-            limited.check_smooth(plan)
-            return _fastest_between_stops(plan, limited, span)
-        if limited.derivatives_only and limited.order <= 2:
-            return _fastest_on_path(plan, limited, span)
         limited.check_smooth(plan)
+        if isinstance(plan, PathPlan):
+            return _fastest_between_stops(plan, limited, span)
         _check_open(plan)
     uniform = fastest_within(plan, limited, span)
     if hold == "shape":
@@ -365,6 +394,8 @@ def _fastest_between_stops(plan: PathPlan, limited: Limited, span: tuple[float, 
         own = limited.of(part)
         if orders is not None:
             laws.append(fastest_segment_law(part, own, orders))
+        elif limited.derivatives_only and limited.order <= 2:
+            laws.append(fastest_law(curve, own.bounds, curve.start, (0.0, 0.0)).plan.law)
         else:
             laws.append(Retimed(part.laws[0], with_fast_time_law(own.seen(part), own).law))
     fast = plan.with_laws(laws).shift(plan.start - laws[0].start)
@@ -425,25 +456,64 @@ def _fastest_in_loop(
     return Fastest(found, margins, feasible, "shape", limited, "", searched, statement)
 
 
-def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, float] | None) -> Fastest:
+def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, float] | None, ends: Ends) -> Fastest:
     """Plan of minimum duration on its path, under limits of velocities and accelerations."""
+    limited.check_constant('limits with hold="path"', over_time=True)
     for jump in plan.jumps(0):
         raise ValueError(f"plan must be continuous, got {jump.label} that jumps by {jump.size:.4g} at {jump.time:g} s")
     _check_rest(plan, limited)
     _closed_form(plan, limited)  # raises for a direction in which no velocity is allowed
-    # Positions in the path have full precision relative to its start.
-    law = fastest_law(plan.shift(-plan.start) if plan.start else plan, limited.bounds, plan.start)
-    found: Trajectory = law.plan.shift(plan.start) if plan.start else law.plan
-    shortest = max(_closed_form(found, limited) * _ABOVE, 0.0 if span is None else span[0])
-    if span is not None and shortest > span[1]:
+    on_path = limited if limited.is_constant else limited.at_positions()
+    find = _with_given_ends if ends == "given" else _with_free_ends
+    found, margins, stops = find(plan, on_path, span)
+    searched = span or (0.0, math.inf)
+    feasible = ((found.duration, found.duration if ends == "given" else searched[1]),)
+    return Fastest(found, margins, feasible, "path", on_path, searched=searched, stops=stops)
+
+
+def _with_free_ends(
+    plan: Trajectory, limited: Limited, span: tuple[float, float] | None
+) -> tuple[Trajectory, Margins, tuple[float, ...]]:
+    """Fastest plan on a path with any speeds at its ends, its margins, and the times of stops at its corners."""
+    law = _law_on_path(plan, limited)
+    found = law.plan
+    slower = [required_rate(bound, law.plan, plan.start) for bound in limited.bounds if _is_over_time(bound)]
+    shortest = max(_closed_form(found, limited), found.duration * max(slower, default=0.0)) * _ABOVE
+    if span is not None and max(shortest, span[0]) > span[1]:
         raise ValueError(
             f"limits must be satisfied for some duration from {span[0]:.4g} to {span[1]:.4g} s, got a minimum of "
             f"{shortest:.6g} s"
         )
-    found, margins = _satisfying(limited, found.retime, shortest)
-    searched = span or (0.0, math.inf)
-    feasible = ((found.duration, searched[1]),)
-    return Fastest(found, margins, feasible, "path", limited, searched=searched, stops=law.stops)
+    return *_satisfying(limited, found.retime, shortest if span is None else max(shortest, span[0])), law.stops
+
+
+def _with_given_ends(
+    plan: Trajectory, limited: Limited, span: tuple[float, float] | None
+) -> tuple[Trajectory, Margins, tuple[float, ...]]:
+    """The same with the speeds of the plan at its ends, with which it cannot be retimed."""
+    if span is not None:
+        raise ValueError(
+            f'durations must not be given with ends="given", got {span[0]:g} to {span[1]:g} s: at other durations the '
+            "speeds at the ends are others"
+        )
+    for reserve in _RESERVES:
+        law = _law_on_path(plan, limited, (1.0, 1.0), reserve)
+        margins = limited.margins(law.plan)
+        if margins.active.fraction >= -_AT_ENDS:
+            return law.plan, margins, law.stops
+    raise ValueError(f"limits must be satisfied with the speeds at the ends, got {margins.active}")
+
+
+def _law_on_path(plan: Trajectory, limited: Limited, given: Rates = (None, None), reserve: float = 0.0) -> FastLaw:
+    """Fast time law; positions in the path have full precision relative to its start."""
+    if not plan.start:
+        return fastest_law(plan, limited.bounds, plan.start, given, reserve)
+    found = fastest_law(plan.shift(-plan.start), limited.bounds, plan.start, given, reserve)
+    return replace(found, plan=found.plan.shift(plan.start))
+
+
+def _is_over_time(bound: Bound) -> bool:
+    return not bound.is_constant and bound.order > 0
 
 
 def _check_open(plan: Trajectory) -> None:

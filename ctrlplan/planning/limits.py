@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -15,9 +16,10 @@ from ctrlplan._display import Displayed, Facts, Part, Table, counted
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.naming import Naming
+from ctrlplan.planning.path_law.positions import maximum_excess
 from ctrlplan.planning.quantities import Response, System, loop_of, path_quantities, quantities_of, system_given
 from ctrlplan.planning.window import mean_square, window
-from ctrlplan.trajectories import PathPlan, Trajectory, derivative_name
+from ctrlplan.trajectories import PathPlan, Retimed, Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.extrema import Extrema, function_extrema
 from ctrlplan.trajectories.trajectory import check_end
@@ -319,6 +321,7 @@ class Limited:
         self._start, self._duration = plan.start, plan.duration
         self._given = limits, system, tail
         self.loop = loop_of(system, tail)
+        self._at_positions = False
         self._on_path = path_quantities(system, plan)
         self._quantities = self._on_path or (None if self.loop is not None else quantities_of(system))
         self.bounds = tuple(Naming(self.seen(plan), self._quantities, self.loop, plan.naxes).bounds(limits))
@@ -335,6 +338,12 @@ class Limited:
         """The same limits for plans of another path."""
         limits, system, tail = self._given
         return Limited(plan, limits, system, tail)
+
+    def at_positions(self) -> Limited:
+        """The same limits, those over time at positions of the given plan instead of parts of its duration."""
+        found = copy(self)
+        found._at_positions = True
+        return found
 
     @property
     def on_path(self) -> bool:
@@ -355,10 +364,10 @@ class Limited:
         """Whether a limit may be violated at long durations although it is satisfied at rest."""
         return any(b.period is not None or (not b.is_constant and _of_motion(b)) for b in self.bounds)
 
-    def check_constant(self, what: str) -> None:
-        """Raise for limits that are not the same at every time of a plan."""
+    def check_constant(self, what: str, *, over_time: bool = False) -> None:
+        """Raise for limits that are not the same at every time of a plan, or, with `over_time`, not those of a time."""
         for bound in self.bounds:
-            if bound.in_loop or not bound.is_constant:
+            if bound.in_loop or not (bound.is_constant or (over_time and bound.kind != "rms")):
                 kind = (
                     "a signal of a loop"
                     if bound.in_loop
@@ -525,6 +534,9 @@ class Limited:
 
     def sides(self, bound: Bound, plan: Trajectory, times: Array) -> tuple[Array, Array]:
         """Minimum and maximum (ntime,) of a signal at times of a plan; infinite where no limit applies."""
+        if self._at_positions and isinstance(plan, Retimed):
+            moments = np.clip(plan.law(times), plan.plan.start, plan.plan.end)
+            return bound.sides(self._start + moments - plan.plan.start)
         return bound.sides(self._start + (times - plan.start) * self._duration / plan.duration)
 
     def rejection(self, plan: Trajectory) -> str:
@@ -603,6 +615,11 @@ class Limited:
     def _margin_over_time(self, plan: Trajectory, k: int) -> Margin:
         """Margin to limits that apply in an interval or change with time."""
         b = self.bounds[k]
+        if self._at_positions and isinstance(plan, Retimed):
+            sizes, times = maximum_excess(b, plan, self._start)
+            side = int(sizes.argmax())
+            moment = self._start + float(plan.law(float(times[side]))) - plan.plan.start
+            return _margin_at(b, moment, float(times[side]), side, float(sizes[side]))
         rate = self._duration / plan.duration
         span = self._interval(b, plan)
         own = (self._start + (span[0] - plan.start) * rate, rate)
@@ -619,10 +636,7 @@ class Limited:
         found = function_extrema(part, excess, self.order, 1.0)
         worst = int(found.maximum.argmax())
         time = float(found.time_max[worst])
-        there = b.at(float(np.clip(own[0] + (time - span[0]) * rate, *(b.interval or (-math.inf, math.inf)))))
-        fraction = float(found.maximum[worst]) - b.slack
-        value = (there.low, there.high)[worst] + (-1.0, 1.0)[worst] * float(found.maximum[worst]) * b.scale
-        return Margin(there, value, time, -fraction)
+        return _margin_at(b, own[0] + (time - span[0]) * rate, time, worst, float(found.maximum[worst]))
 
     def _interval(self, bound: Bound, plan: Trajectory) -> tuple[float, float]:
         """Interval [s] of a plan in which limits apply, in the plan's time."""
@@ -849,6 +863,13 @@ def _check_period(bound: Bound, plan: Trajectory) -> None:
 def _rms_margin(bound: Bound, value: float, plan: Trajectory) -> Margin:
     fraction = (bound.high - value) / bound.scale
     return Margin(bound, value, plan.start + (bound.period or plan.duration), fraction)
+
+
+def _margin_at(bound: Bound, moment: float, time: float, side: int, excess: float) -> Margin:
+    """Margin to limits over time, by the excess over the lower (0) or upper one (1) at a moment of the plan."""
+    there = bound.at(float(np.clip(moment, *(bound.interval or (-math.inf, math.inf)))))
+    value = (there.low, there.high)[side] + (-1.0, 1.0)[side] * excess * bound.scale
+    return Margin(there, value, time, bound.slack - excess)
 
 
 def _axis_margin(bound: Bound, extrema: Extrema) -> Margin:

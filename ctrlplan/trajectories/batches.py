@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from ctrlplan.trajectories.chebyshev import points, transform
 from ctrlplan.trajectories.common import Array, readonly
 
-if TYPE_CHECKING:
-    from ctrlplan.trajectories.trajectory import Trajectory
-
 _DEGREE = 16
 """Degree of the interpolant on a piece of a segment."""
 
-_HALVINGS = 8
-"""Maximum number of times by which a segment is halved until interpolants resolve a derivative."""
+_HALVINGS, _ANYWHERE, _AT_KINKS = 40, 8, 64
+"""Maximum number of times by which a segment is halved until interpolants resolve a derivative: about kinks, and
+anywhere, that is in more than so many pieces."""
 
 _QUARTERINGS = 26
 """Maximum number of times by which a piece is divided in four: to the resolution of its length."""
@@ -27,7 +25,22 @@ _QUARTERINGS = 26
 _RESOLVED = 1e-11
 """Error of an interpolant relative to the maximum of the derivative."""
 
-_ROUNDING = 16.0 * float(np.finfo(float).eps)
+_ROUNDING = 64.0 * float(np.finfo(float).eps)
+
+
+class Segmented(Protocol):
+    """Functions of time that are analytic between breakpoints; as `Trajectory`."""
+
+    @property
+    def breakpoints(self) -> Array:
+        """Times [s]."""
+
+    @property
+    def naxes(self) -> int:
+        """Number of functions."""
+
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives (order + 1, naxes, ntime), each time in its own segment."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +66,7 @@ class _Pieces:
     width: Array
 
 
-def inner_extrema(plan: Trajectory, nu: int, low: Array, high: Array) -> tuple[NDArray[np.intp], Array]:
+def inner_extrema(plan: Segmented, nu: int, low: Array, high: Array) -> tuple[NDArray[np.intp], Array]:
     """Segments, and times [s] since their starts, of extrema of a derivative beyond given values.
 
     The sum of the magnitudes of its coefficients bounds an interpolant. Pieces
@@ -61,7 +74,7 @@ def inner_extrema(plan: Trajectory, nu: int, low: Array, high: Array) -> tuple[N
 
     Parameters
     ----------
-    plan : Trajectory
+    plan : Segmented
         Plan whose segments are evaluated together.
     nu : int
         Order of the derivative.
@@ -76,7 +89,7 @@ def inner_extrema(plan: Trajectory, nu: int, low: Array, high: Array) -> tuple[N
     return segments, (pieces.first[chosen] + pieces.width[chosen] * parts) * np.diff(plan.breakpoints)[segments]
 
 
-def _interpolated(plan: Trajectory, nu: int, size: Array) -> _Pieces:
+def _interpolated(plan: Segmented, nu: int, size: Array) -> _Pieces:
     """Interpolants of a derivative, whose magnitude is at least `size` (naxes,)."""
     durations = np.diff(plan.breakpoints)
     segment, first, width = np.arange(durations.size), np.zeros(durations.size), 1.0
@@ -88,7 +101,9 @@ def _interpolated(plan: Trajectory, nu: int, size: Array) -> _Pieces:
         size = np.maximum(size, np.abs(values).max(axis=(1, 2)))
         series = transform(values)
         missed = np.abs(series[..., -3:]).max(axis=2)
-        ready = (missed <= _RESOLVED * size[:, None]).all(axis=0) | (halving == _HALVINGS)
+        ready = (missed <= _RESOLVED * size[:, None]).all(axis=0)
+        if halving == _HALVINGS or (halving >= _ANYWHERE and ready.size - np.count_nonzero(ready) > _AT_KINKS):
+            ready[:] = True
         slack = missed[:, ready] + _ROUNDING * size[:, None]
         own = np.full(np.count_nonzero(ready), width)
         found.append(_Pieces(series[:, ready], slack, segment[ready], first[ready], own))

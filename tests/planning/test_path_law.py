@@ -293,3 +293,146 @@ def test_an_interval_of_durations():
 def test_positions_that_violate_their_limits_are_rejected():
     with pytest.raises(ValueError, match="limits must be satisfied at rest"):
         fastest(MOVE, {"y": (0.0, 0.9), "velocity": 1.0}, hold="path")
+
+
+# Limits that depend on the position
+
+TEN = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(10, 10, 0, 0)])
+
+
+@pytest.mark.parametrize("start", [0.0, 100.0])
+def test_a_limit_in_a_part_of_the_path(start):
+    """To 2 m/s in 2 s, on for 0.75 s, down to 1 m/s in the middle at 5 m in 1 s, on for 4.5 s, and to rest in 1 s."""
+    slow = cp.Limits(-1.0, 1.0, during=(start + 5.0, start + 10.0))
+    found = fastest(TEN.shift(start), {"y_d1": [cp.Limits(-2.0, 2.0), slow], "y_d2": 1.0}, hold="path")
+    assert 9.25 <= found.duration <= 9.25 * 1.003
+    t = np.linspace(found.plan.start, found.plan.end, COUNT)
+    position, velocity, acceleration = found.plan.jet(t, 2)[:, 0]
+    assert velocity[position > 5.0 + 1e-9].max() <= 1.0 + 1e-10
+    assert velocity.max() <= 2.0 + 1e-10
+    assert np.abs(acceleration).max() <= 1.0 + 1e-10
+    assert found.margins.satisfied
+    assert found.margins.active.fraction == pytest.approx(0.0, abs=1e-9)
+
+
+def by_table(times):
+    return np.interp(times, [0.0, 4.0, 10.0], [2.0, 0.5, 1.5])
+
+
+@pytest.mark.parametrize("kind", ["along", "function"])
+def test_a_limit_that_changes_along_the_path(kind):
+    limit = {
+        "along": cp.Limits(high=[2.0, 0.5, 1.5], along=[0.0, 4.0, 10.0]),
+        "function": cp.Limits(high=by_table),
+    }[kind]
+    found = fastest(TEN, {"y_d1": limit, "y_d2": 0.4}, hold="path")
+    t = np.linspace(found.plan.start, found.plan.end, COUNT)
+    moment, velocity = found.plan.law(t), found.plan(t, 1)
+    assert (velocity <= by_table(moment) + 1e-9).all()
+    assert np.abs(found.plan(t, 2)).max() <= 0.4 * (1 + 1e-10)
+    assert found.margins.satisfied
+    # Slower than with the largest limit, faster than with the smallest.
+    durations = [fastest(TEN, {"y_d1": v, "y_d2": 0.4}, hold="path").duration for v in (2.0, 0.5)]
+    assert durations[0] < found.duration < durations[1]
+    # Of the limits over the plan that it plots: the same.
+    bound = next(row.bound for row in found.margins if row.bound.name == "y_d1")
+    high = found.limited.sides(bound, found.plan, t)[1]
+    np.testing.assert_allclose(high, by_table(moment), rtol=1e-12)
+
+
+def test_accelerations_that_depend_on_the_position():
+    """An arm that may accelerate less the further it is out: v^2/2 is the integral of 1 - 0.08 x up to the middle."""
+    limits = {"y_d2": cp.Limits(lambda t: -1.0 + 0.08 * TEN(t), lambda t: 1.0 - 0.08 * TEN(t))}
+    found = fastest(TEN, limits, hold="path")
+    # Speeding up to a position x and braking from there: the areas agree.
+    area = 10.0 - 0.04 * 10.0**2
+    turn = (1.0 - math.sqrt(1.0 - 0.08 * area)) / 0.08
+    u = (np.arange(200_000) + 0.5) / 200_000
+    up = turn * u**2
+    down = 10.0 - (10.0 - turn) * u**2
+    best = (2 * turn * u / np.sqrt(2 * up - 0.08 * up**2)).mean()
+    rest = 2.0 * (10.0 - down) - 0.08 * (100.0 - down**2)
+    best += (2 * (10.0 - turn) * u / np.sqrt(rest)).mean()
+    assert best <= found.duration * (1 + 1e-6)
+    assert found.duration <= 1.004 * best
+
+
+# Speeds at the ends
+
+MOVING = PolySpline([Waypoint(0, 0, 1, 0), Waypoint(3, 3, 1, 0)])
+
+
+@pytest.mark.parametrize(("velocity", "best"), [(2.0, 2.0), (1.0, 3.0), (1.2, None)])
+def test_given_speeds_at_the_ends(velocity, best):
+    """From 1 m/s over 3 m to 1 m/s: 1 s to 2 m/s and 1 s back; at a limit of 1 m/s without acceleration."""
+    found = fastest(MOVING, {"velocity": velocity, "acceleration": 1.0}, hold="path", ends="given")
+    if best is None:  # 0.2 s up and down, and 3 - 2*0.22 m at 1.2 m/s
+        best = 0.4 + (3.0 - 0.44) / 1.2
+    assert best * (1 - 1e-9) <= found.duration <= best * 1.003
+    speeds = [found.plan.jet(t, 1, left=left)[1, 0] for t, left in ((found.plan.start, False), (found.plan.end, True))]
+    assert speeds == pytest.approx([1.0, 1.0], rel=1e-14)
+    check_limits(found.plan, {"velocity": velocity, "acceleration": 1.0})
+    assert found.feasible == ((found.duration, found.duration),)
+
+
+def test_given_speeds_on_a_path_in_space():
+    velocities = np.full((2, 4), np.nan)
+    velocities[:, 0], velocities[:, -1] = [0.5, 0.3], [0.2, -0.4]
+    points = np.random.default_rng(3).normal(size=(2, 4))
+    plan = PiecewiseSpline.from_arrays([0.0, 1.0, 2.5, 4.0], points, derivatives={1: velocities})
+    limits = {"velocity": 2.0, "acceleration": 40.0}
+    given, free = (fastest(plan, limits, hold="path", ends=ends) for ends in ("given", "free"))
+    np.testing.assert_allclose(given.plan.jet(given.plan.start, 1)[1], [0.5, 0.3], rtol=1e-13)
+    np.testing.assert_allclose(given.plan.jet(given.plan.end, 1, left=True)[1], [0.2, -0.4], rtol=1e-13)
+    check_limits(given.plan, limits)
+    assert given.margins.satisfied
+    assert free.duration < given.duration < free.duration + 0.5  # less than the time for the change of speed
+
+
+@pytest.mark.parametrize(
+    ("plan", "limits", "message"),
+    [
+        (MOVING, {"velocity": 0.9, "acceleration": 1.0}, r"the speed at the start must be feasible .* at most 0\.9"),
+        (
+            PolySpline([Waypoint(0, 0, 3, 0), Waypoint(3, 3, 0, 0)]),  # 3^2/2/1.4 is more than 3 m
+            {"acceleration": 1.4},
+            r"the speed at the start must be feasible .* got 1 times that of the plan, where at most 0\.9[56]",
+        ),
+        (
+            PolySpline([Waypoint(0, 0, 0, 0), Waypoint(3, 3, 3, 0)]),
+            {"acceleration": 1.4},
+            "the speed at the end must be feasible within the limits",
+        ),
+    ],
+)
+def test_speeds_that_are_infeasible(plan, limits, message):
+    with pytest.raises(ValueError, match=message):
+        fastest(plan, limits, hold="path", ends="given")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"ends": "fixed"}, "ends must be one of free, given, got 'fixed'"),
+        ({"ends": "given", "hold": "shape"}, 'ends must be "free" unless hold is "path"'),
+        ({"ends": "given", "durations": (1.0, 9.0)}, 'durations must not be given with ends="given"'),
+        ({"ends": "given", "limits": {"jerk": 1.0}}, 'ends must be "free" with limits of quantities'),
+    ],
+)
+def test_ends_that_do_not_apply(options, message):
+    with pytest.raises(ValueError, match=message):
+        fastest(MOVING, **({"limits": LIMITS, "hold": "path"} | options))
+
+
+def test_a_path_with_stops_between_its_segments():
+    """A vehicle that turns back: each segment has its own law from rest to rest."""
+    there = PolySpline([Waypoint(0, [0, 0], [1, 0]), Waypoint(4, [4, 0], [1, 0])])
+    back = PolySpline([Waypoint(0, [4, 0], [-1, 0]), Waypoint(1, [3, 0], [-1, 0])])
+    law = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(9, 4, 0, 0)])
+    other = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(9, 1, 0, 0)])
+    plan = cp.PathPlan([there, back], [1, -1], [law, other])
+    found = fastest(plan, {"x_d1": 10.0, "x_d2": 1.0}, hold="path")
+    assert isinstance(found.plan, cp.PathPlan)
+    assert 6.0 <= found.duration <= 6.0 * 1.003
+    assert found.plan.stops[1] - found.plan.stops[0] == pytest.approx(4.0, rel=0.003)
+    assert found.margins.satisfied

@@ -10,5 +10,6 @@ divided (`law`).
 """
 
 from ctrlplan.planning.path_law.law import FastLaw, fastest_law
+from ctrlplan.planning.path_law.spans import Rates
 
-__all__ = ["FastLaw", "fastest_law"]
+__all__ = ["FastLaw", "Rates", "fastest_law"]

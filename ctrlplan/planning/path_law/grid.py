@@ -90,11 +90,11 @@ class Grid:
         bends[last] = [bend for part in self.parts for bend in part.bends]
         return ratios, bends
 
-    def ends(self, rate: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Cells that begin, and those that end, with a prescribed squared rate."""
+    def ends(self, moving: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Cells that begin, and those that end, with a prescribed rate, in motion or at rest."""
         first = np.flatnonzero(np.diff(self.part, prepend=-1))
         last = np.append(first[1:], self.part.size) - 1
-        chosen = np.array([[own == rate for own in part.rates] for part in self.parts])
+        chosen = np.array([[rate is not None and (rate > 0.0) == moving for rate in part.rates] for part in self.parts])
         return first[chosen[:, 0]], last[chosen[:, 1]]
 
     def jets(self, fractions: Array) -> Array:

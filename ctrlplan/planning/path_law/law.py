@@ -11,7 +11,7 @@ from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.interior_point import Problem, minimum
 from ctrlplan.planning.path_law.rows import POINTS, Activity, Rows, basis
-from ctrlplan.planning.path_law.spans import Part, parts_of
+from ctrlplan.planning.path_law.spans import Part, Rates, parts_of
 from ctrlplan.planning.path_law.sweep import swept
 from ctrlplan.trajectories import Retimed, TimeLaw, Trajectory
 from ctrlplan.trajectories.common import Array, readonly
@@ -52,7 +52,7 @@ def fastest_law(
     plan: Trajectory,
     bounds: Sequence[Bound],
     start: float,
-    fixed: tuple[bool, bool] = (False, False),
+    given: Rates = (None, None),
     reserve: float = 0.0,
 ) -> FastLaw:
     """Time law of minimum duration under limits of velocities and accelerations.
@@ -65,8 +65,8 @@ def fastest_law(
         Limits of first and second derivatives of axes.
     start : float
         Start [s] of the plan for which limits over time are given.
-    fixed : (bool, bool), optional
-        Whether the velocities of the plan at its ends are kept.
+    given : (float or None, float or None), optional
+        Squared rates of the law at its ends; None for free ones.
     reserve : float, optional
         Distance from the limits, relative to them.
 
@@ -76,14 +76,14 @@ def fastest_law(
         If the rate is not limited, or velocities at the ends are infeasible.
     """
     edges = [time - start + plan.start for bound in bounds for time in _changes(bound)]
-    parts = parts_of(plan, any(bound.order == 2 for bound in bounds), edges, fixed)
+    parts = parts_of(plan, any(bound.order == 2 for bound in bounds), edges, given)
     grid = Grid.of(plan, [part for part in parts if part.moves])
     for refinement in range(_REFINEMENTS + 1):
         spline, activity = Spline.of(grid), Activity.of(grid, bounds, POINTS, start)
-        rows = activity.rows(grid.length).with_reserve(reserve, *grid.ends(1.0))
+        rows = activity.rows(grid.length).with_reserve(reserve, *grid.ends(moving=True))
         problem = _problem(grid, spline, rows)
         x = swept(grid, spline, rows)
-        scale = _START * problem.feasible_scale(x) if not any(fixed) else _START
+        scale = _START if any(given) else _START * problem.feasible_scale(x)
         x = minimum(problem, np.where(spline.fixed, x, scale * x))
         local = spline.coefficients(x)
         loss = _losses(activity.worst(POINTS, local, grid.length), local, grid.length)
@@ -104,7 +104,7 @@ def _problem(grid: Grid, spline: Spline, rows: Rows) -> Problem:
     weights = _WEIGHTS[:, None] * grid.length
     # 1/sqrt(b) is integrated by the square root of the distance from a point at which b is 0.
     root = 2.0 * _NODES[:, None]
-    first, last = grid.ends(0.0)
+    first, last = grid.ends(moving=False)
     values[:, first], weights[:, first] = basis(_NODES**2)[0][:, None], weights[:, first] * root
     values[:, last], weights[:, last] = basis(1.0 - _NODES**2)[0][:, None], weights[:, last] * root
     return Problem(spline, spline.rows(values), weights, spline.rows(rows.factors), rows.upper, rows.lower)

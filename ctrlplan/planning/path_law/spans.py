@@ -18,6 +18,10 @@ _NEAR = 0.01
 """Distance from the end of a span at which its velocity is compared with that at twice the distance."""
 
 
+Rates = tuple[float | None, float | None]
+"""Squared rates at both ends of a part, relative to those of the plan; None for free ones."""
+
+
 @dataclass(frozen=True)
 class Span:
     """Part of a plan that is analytic.
@@ -71,7 +75,7 @@ class Part:
     spans: tuple[Span, ...]
     ratios: tuple[float, ...]
     bends: tuple[float, ...]
-    rates: tuple[float | None, float | None]
+    rates: Rates
     closed: bool = False
 
     @property
@@ -80,9 +84,7 @@ class Part:
         return self.spans[0].moves
 
 
-def parts_of(
-    plan: Trajectory, stops: bool, edges: Sequence[float] = (), fixed: tuple[bool, bool] = (False, False)
-) -> list[Part]:
+def parts_of(plan: Trajectory, stops: bool, edges: Sequence[float] = (), given: Rates = (None, None)) -> list[Part]:
     """Parts of a plan, dwells included.
 
     Parameters
@@ -93,20 +95,21 @@ def parts_of(
         Whether the plan stops at corners of the path.
     edges : sequence of float, optional
         Times [s] at which limits change.
-    fixed : (bool, bool), optional
-        Whether the plan keeps its velocities at both ends.
+    given : (float or None, float or None), optional
+        Squared rates at both ends; None for free ones.
     """
     spans, joints = _spans(plan, stops, edges)
     ends = [0, *(k + 1 for k, joint in enumerate(joints) if joint.stops), len(spans)]
     parts = []
     for first, last in pairwise(ends):
         inner = [*joints[first : last - 1], _Joint(True, False)]
-        start = (1.0 if fixed[0] else None) if first == 0 else 0.0 if joints[first - 1].corner else None
-        end = (1.0 if fixed[1] else None) if last == len(spans) else 0.0 if joints[last - 1].corner else None
-        rates = None if spans[first].rests[0] else start, None if spans[last - 1].rests[1] else end
+        start = given[0] if first == 0 else 0.0 if joints[first - 1].corner else None
+        stop = given[1] if last == len(spans) else 0.0 if joints[last - 1].corner else None
+        rates = None if spans[first].rests[0] else start, None if spans[last - 1].rests[1] else stop
         ratios, bends = tuple(joint.ratio for joint in inner), tuple(joint.bend for joint in inner)
         parts.append(Part(tuple(spans[first:last]), ratios, bends, rates))
-    closing = _closing(plan) if spans[0].moves and spans[-1].moves and not any(fixed) else None
+    free = spans[0].moves and spans[-1].moves and given == (None, None)
+    closing = _closing(plan) if free else None
     if closing is None:
         return parts
     begin, end = parts[0], parts[-1]
@@ -114,8 +117,12 @@ def parts_of(
     if len(parts) == 1:
         return [replace(begin, ratios=ratios, bends=bends, closed=True)]
     # The last part leads into the first.
-    rates = end.rates[0], begin.rates[1]
-    parts[0] = Part(parts.pop().spans + begin.spans, ratios + begin.ratios, bends + begin.bends, rates)
+    parts[0] = Part(
+        parts.pop().spans + begin.spans,
+        ratios + begin.ratios,
+        bends + begin.bends,
+        (end.rates[0], begin.rates[1]),
+    )
     return parts
 
 

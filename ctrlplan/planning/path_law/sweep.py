@@ -6,6 +6,7 @@ import numpy as np
 
 from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.rows import Rows
+from ctrlplan.planning.path_law.spans import Rates
 from ctrlplan.trajectories.common import Array
 
 _ROUNDS = 4
@@ -61,7 +62,7 @@ class _Cells:
         self._of_end, self._of_start = _lines(start, end), _lines(end, start)
         self._best_end, self._largest_start = _peaks(*self._of_end)
 
-    def open(self, begin: int, end: int, rates: tuple[float | None, float | None]) -> Array:
+    def open(self, begin: int, end: int, rates: Rates) -> Array:
         """Rates at the starts of the cells of an open part, and at its end, some of which may be prescribed."""
         limit = np.empty(end - begin + 1)
         limit[-1] = self._largest_end(end - 1) if rates[1] is None else rates[1]
@@ -69,6 +70,9 @@ class _Cells:
         if rates[0] is not None:
             _check_speed("start", rates[0], limit[0])
             limit[0] = rates[0]
+        if rates[1] is not None:  # the last cell reaches it
+            offset, slope = self._of_end
+            limit[-2] = min(limit[-2], (offset[end - 1] + slope[end - 1] * rates[1]).min())
         nodes = self._forward(limit, begin)
         if rates[1] is not None:
             _check_speed("end", rates[1], nodes[-1])
@@ -110,10 +114,9 @@ class _Cells:
 
 def _check_speed(where: str, rate: float, largest: float) -> None:
     if rate > largest * (1.0 + 1e-9):
-        reason = "slow down for the path that follows" if where == "start" else "be reached"
         raise ValueError(
-            f"the speed at the {where} must {reason} within the limits, got that of the plan where at most "
-            f"{largest**0.5:.6g} of it may be"
+            f"the speed at the {where} must be feasible within the limits, got {rate**0.5:.6g} times that of the plan, "
+            f"where at most {max(largest, 0.0) ** 0.5:.6g} times it is"
         )
 
 
