@@ -45,7 +45,7 @@ Build the loop
     sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
     create_shaper_iosystem    input shaping of an operator's commands, also for a measured frequency
     create_command_filter_iosystem    filter with derivative outputs; command_filter_gains: its feedforward
-    plants                    motor, flexible joint, integrators, crane with its loops; Law: laws of the crane
+    plants                    crane, car, quadrotor, levitation, drives, ... -> Plant; Law: laws of the crane
     declare, traits_of        what the simulation must know of a block of your own -> BlockTraits
 Simulate
     simulate                  response of any python-control system -> SimulationResponse; exact if linear

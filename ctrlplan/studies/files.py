@@ -245,6 +245,8 @@ class StudyFile:
             if isinstance(loop, FlatLoops):
                 for name, plan in self.plans.items():
                     loop.check_end(name, plan, self.t_end)
+                    if self.benefit:
+                        loop.check_benefit(plan)
             experiment = Experiment(self.plans, self.timepts(loop), waypoints=self.waypoints, **fields_of)
             with np.errstate(over="ignore", invalid="ignore"):  # a diverging run is reported by the simulation
                 found = experiment.run(loop)

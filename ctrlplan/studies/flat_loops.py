@@ -85,6 +85,16 @@ class FlatLoops:
         if plan.end < end and any(jump.order == 1 and jump.time == plan.end for jump in plan.jumps(1)):
             self._state_at_rest(name, plan, plan.final, f"end at rest, or at t_end = {end:g} s, got {plan.end:g} s,")
 
+    def check_benefit(self, plan: Trajectory) -> None:
+        """Raise if baselines, which begin and end at rest, have no states of the plant."""
+        try:
+            self._state_at_rest("", plan, plan.initial)
+        except ValueError:
+            raise ValueError(
+                f"benefit must be false for {self.flat.name}, got true: its maps are singular at rest, where baselines "
+                "begin and end"
+            ) from None
+
     def _state_at_rest(self, name: str, plan: Trajectory, position: Array, must: str = "be continuous") -> Array:
         """State of the plant at rest at a position; ValueError with what the plan must be if there is none."""
         try:

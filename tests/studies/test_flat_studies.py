@@ -82,6 +82,9 @@ def same(found, known):
 
 
 def test_every_plant_has_a_kind_with_its_parameters():
+    exported = [getattr(cp.plants, name) for name in cp.plants.__all__]
+    kinds = {kind for kind in exported if isinstance(kind, type) and issubclass(kind, cp.plants.Plant)}
+    assert kinds - {cp.plants.Plant, cp.plants.Crane} == set(PLANTS.values())
     for kind, plant in PLANTS.items():
         entries = LOOP_KINDS[kind].entries
         own = set(vars(plant()))
@@ -262,6 +265,7 @@ WRONG = {
         ["plan step must be continuous for a feedforward"],
     ),
     "a car that stops at once": (lane(t_end=4.0), ["plan polynomial must end at rest, or at t_end = 4 s", "3 s"]),
+    "the benefit of a car": (lane(benefit=True), ["benefit must be false for kinematic_car, got true"]),
     "a plan to the end of the run": (motor(t_end=1.0), ["t_end", "after the last waypoint"]),
     "poles for a loop": (
         motor(loop=FROM_MODULE | {"kind": "python:own_plant:loop"}),

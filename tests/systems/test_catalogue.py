@@ -102,6 +102,12 @@ def apart(found, known, scale=1.0):
     return float((np.abs(found - known).max(axis=1) / size).max())
 
 
+def test_every_plant_is_a_case():
+    exported = [getattr(cp.plants, name) for name in cp.plants.__all__]
+    kinds = {kind for kind in exported if isinstance(kind, type) and issubclass(kind, cp.plants.Plant)}
+    assert kinds - {cp.plants.Plant} == {type(case.plant) for case in CASES.values()}
+
+
 # The equations
 
 
