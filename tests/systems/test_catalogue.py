@@ -330,7 +330,7 @@ def test_a_payload_that_the_law_does_not_know():
     assert errors[1] < 1e-9
 
 
-@everyday("quadrotor")
+@pytest.mark.parametrize("case", [CASES["quadrotor"], CASES["drive, damped"]], ids=["quadrotor", "drive"])
 def test_margins_over_a_range_of_a_parameter(case):
     label = next(iter(case.plant.flat_system().params))
     value, signal = getattr(case.plant, label), next(iter(case.plant.signals.inputs))
