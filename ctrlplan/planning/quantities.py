@@ -173,8 +173,8 @@ def path_quantities(system: Any, plan: Trajectory) -> HasRates | None:
     system : object
         System of the limited signals.
     plan : Trajectory
-        The plan; a `PathPlan` and a flat system are evaluated through the path
-        parameter, for any time law.
+        The plan; a `PathPlan` and a flat system, or a plant with a method
+        ``flat_system``, are evaluated through the path parameter, for any time law.
 
     Raises
     ------
@@ -182,11 +182,15 @@ def path_quantities(system: Any, plan: Trajectory) -> HasRates | None:
         If the inputs of a flat system do not set its pace, or states are not
         determined along the path.
     """
-    if not isinstance(plan, PathPlan) or not (hasattr(system, "forward") and hasattr(system, "reverse")):
+    if not isinstance(plan, PathPlan) or isinstance(system, type):
+        return None
+    own = getattr(system, "flat_system", None)
+    flat = own() if callable(own) else system
+    if not (hasattr(flat, "forward") and hasattr(flat, "reverse")):
         return None
     from ctrlplan.flatness.quantities import QuantitiesOnPath
 
-    return QuantitiesOnPath(system, plan)
+    return QuantitiesOnPath(flat, plan)
 
 
 def loop_of(system: Any, tail: float | None = None) -> Loop | None:

@@ -1,9 +1,10 @@
 """States and inputs of vehicles along a path with stops, against closed forms; plants that reject it."""
 
+import control as ct
 import control.flatsys as fs
 import numpy as np
 import pytest
-from parking import BACKWARD, FORWARD, by_hand, curve, expected, law, parking
+from parking import BACKWARD, FORWARD, WHEELBASE, by_hand, curve, expected, law, parking
 
 pytest.importorskip("casadi")
 
@@ -29,6 +30,26 @@ def test_cars_have_finite_states_and_inputs_at_the_stops(flat):
     one, inputs = flat.states_and_inputs(PLAN, 5.0)
     np.testing.assert_allclose(one, x[:, -2], rtol=1e-13, atol=1e-13)
     assert inputs.shape == (2,)
+
+
+def test_the_car_of_python_control_with_its_limited_steering_angle():
+    """The equations of its example: parameters, and a steering angle that is limited by clip."""
+
+    def update(t, x, u, params):
+        delta = np.clip(u[1], -params["maxsteer"], params["maxsteer"])
+        return np.array([np.cos(x[2]) * u[0], np.sin(x[2]) * u[0], u[0] / params["wheelbase"] * np.tan(delta)])
+
+    names = {"states": ("x", "y", "theta"), "inputs": ("v", "delta"), "outputs": ("x", "y", "theta")}
+    plant = ct.nlsys(update, None, **names, params={"wheelbase": WHEELBASE, "maxsteer": 0.5}, name="kincar")
+    wide = cp.PathPlan([2.5 * FORWARD, 2.5 * BACKWARD], [1, -1], law(8.0))
+    t = np.linspace(0.0, 16.0, 33)
+    flat = cp.flat_system(plant, ["x", "y"])
+    x, u = flat.states_and_inputs(wide, t)
+    theta, speed, delta, _ = expected(wide, t)
+    np.testing.assert_allclose(x[2], theta, atol=1e-10)
+    np.testing.assert_allclose(u, [speed, delta], atol=1e-10)
+    with pytest.raises(ValueError, match=r"segments\[0\] of the plan, .*kincar must stay on the branch .*maxsteer"):
+        flat.states_and_inputs(PLAN, 0.0)
 
 
 def test_unicycle_and_trailers_follow_the_equations():

@@ -67,6 +67,9 @@ def test_the_same_margins_from_equations():
     from flat_plants import car, car_rate
 
     own = {row.bound.name: row.value for row in cp.margins(PLAN, LIMITS, FLAT)}
+    renamed = {"theta" if name == "th" else name: limit for name, limit in LIMITS.items()}
+    for row in cp.margins(PLAN, renamed, cp.plants.KinematicCar(wheelbase=3.0)):
+        assert row.value == pytest.approx(own[row.bound.name.replace("theta", "th")], rel=1e-8, abs=1e-9)
     for plant, limits in ((car, LIMITS), (car_rate, LIMITS | {"delta": 1.0, "rate": 2.0})):
         flat = cp.flat_system(plant, ["x", "y"], at={"v": 1.0})
         for row in cp.margins(PLAN, limits, flat):
