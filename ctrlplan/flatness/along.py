@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
-from ctrlplan.flatness.maps import FlatMaps, SingularError, inverses
+from ctrlplan.flatness.maps import TRIALS, FlatMaps, SingularError, inverses
 from ctrlplan.flatness.rest import ADVICE, note_of_rest
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.trajectory import check_end
@@ -32,6 +32,12 @@ _SEARCHES = 8
 
 _MINIMA = 8
 """Local minima at the nodes among which a singular point is searched for."""
+
+_DETOUR = 200
+"""Maximum number of steps along one side of a detour."""
+
+_DENSE = 64
+"""Number of flags in a sequence from which on straight lines between neighbours are sufficient."""
 
 _DEEPEST = 24
 """Number of halvings of an interval."""
@@ -141,31 +147,45 @@ def connected(maps: FlatMaps, flag: Array, p: Array, start: Array | None, name: 
     that turns round), the first of a fixed list of detours.
     """
     z = maps.start if start is None else start
+    return _connected(maps, flag, p, z, max(maps.orders), _DETOUR, f"{name}{_when(time)}")
+
+
+def connected_with_neighbour(maps: FlatMaps, flag: Array, p: Array, z: Array, name: str, count: int) -> Array:
+    """State of a flag, connected with that of the flag before it in a sequence of `count`.
+
+    Detours are tried in sequences of few flags only, in first derivatives: many flags
+    are near each other, and plans that are infeasible for the plant are tried in
+    large numbers.
+    """
+    return _connected(maps, flag, p, z, 2 if count < _DENSE else 0, _DETOUR // 5, name)
+
+
+def _connected(maps: FlatMaps, flag: Array, p: Array, z: Array, orders: int, trials: int, name: str) -> Array:
     try:
         return _straight(maps, z, flag, p)
     except SingularError as error:
-        for detour in _detours(maps.orders, maps.flags(z, p), flag):
+        for detour in _detours(maps.orders, maps.flags(z, p), flag, orders):
             try:
-                return _straight(maps, _straight(maps, z, detour, p), flag, p)
+                return _straight(maps, _straight(maps, z, detour, p, trials), flag, p, trials)
             except SingularError:
                 continue
         raise ValueError(
-            f"states of {name}{_when(time)} must be connected with the operating point, but {error}; give start= or "
+            f"states of {name} must be connected with the operating point, but {error}; give start= or "
             "another operating point at="
         ) from None
 
 
-def _straight(maps: FlatMaps, z: Array, flag: Array, p: Array) -> Array:
+def _straight(maps: FlatMaps, z: Array, flag: Array, p: Array, trials: int = TRIALS) -> Array:
     """State of a flag, connected with a state by a straight line of flags."""
     origin = maps.flags(z, p)
-    return maps.followed(z, lambda s: origin + s * (flag - origin) if s < 1.0 else flag, p)
+    return maps.followed(z, lambda s: origin + s * (flag - origin) if s < 1.0 else flag, p, trials=trials)
 
 
-def _detours(orders: tuple[int, ...], origin: Array, goal: Array) -> Iterator[Array]:
-    """Flags between two others, off the straight line by their distance in one derivative of one flat output."""
+def _detours(orders: tuple[int, ...], origin: Array, goal: Array, count: int) -> Iterator[Array]:
+    """Flags between two others, off the straight line by their distance in one of the derivatives below `count`."""
     order = np.concatenate([np.arange(r) for r in orders])
     distance = np.abs(goal - origin)
-    for nu in range(1, max(orders)):
+    for nu in range(1, min(count, max(orders))):
         rows = np.flatnonzero(order == nu)
         size = float(distance[rows].max(initial=0.0))
         for row in rows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,16 @@ from ctrlplan._checks import checked_finite
 from ctrlplan._display import Facts, Part
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Params, Value
-from ctrlplan.flatness.along import Grid, check_branch, connected, grid_of, on_branch, rows_of, states_along
+from ctrlplan.flatness.along import (
+    Grid,
+    check_branch,
+    connected,
+    connected_with_neighbour,
+    grid_of,
+    on_branch,
+    rows_of,
+    states_along,
+)
 from ctrlplan.flatness.maps import SINGULAR, FlatMaps, regularity
 from ctrlplan.flatness.on_path import FORWARD, CurveMap
 from ctrlplan.flatness.system import FlatSystem
@@ -107,6 +117,26 @@ class DerivedFlatSystem(FlatSystem):
                 "again with ctrlplan.flat_system in this process"
             )
         return self._analysis
+
+    def with_params(self, params: Mapping[str, float]) -> DerivedFlatSystem:
+        """Same plant with other values of parameters.
+
+        Parameters
+        ----------
+        params : mapping of str to float
+            Values by name; the others stay. The operating point stays, too.
+
+        Raises
+        ------
+        ValueError
+            If a name is unknown, or a value is not finite.
+        """
+        values = self._values(params).tolist()
+        found = copy(self)
+        found.params = dict(zip(self._names, values, strict=True))
+        found._current_params = dict(found.params)
+        found.forward, found.reverse = found._forward, found._reverse
+        return found
 
     def _describe(self) -> Iterator[Part]:
         yield from super()._describe()
@@ -269,7 +299,11 @@ class DerivedFlatSystem(FlatSystem):
             left = left[~found]
             if left.size:
                 k = int(left[0])
-                near = z[:, k] = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
+                if k:
+                    near = connected_with_neighbour(maps, flags[:, k], p, near, str(self.name), flags.shape[1])
+                else:
+                    near = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
+                z[:, k] = near
                 left = left[1:]
         return z
 

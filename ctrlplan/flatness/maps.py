@@ -18,6 +18,9 @@ from ctrlplan.symbolic.tape import Tape
 _SHORTEST = 2.0**-25
 """Smallest step, relative to the length of a path."""
 
+TRIALS = 2000
+"""Maximum number of steps along a path."""
+
 _MOVED = 0.3
 """Distance in scales that a corrector may move."""
 
@@ -178,7 +181,13 @@ class FlatMaps:
         return z, found
 
     def followed(
-        self, z: Array, path: Callable[[float], Array], p: Array, first: float = 0.0, last: float = 1.0
+        self,
+        z: Array,
+        path: Callable[[float], Array],
+        p: Array,
+        first: float = 0.0,
+        last: float = 1.0,
+        trials: int = TRIALS,
     ) -> Array:
         """State at the end of a path of flags, connected with the state at its start.
 
@@ -190,6 +199,8 @@ class FlatMaps:
             Flag (nz,) at a parameter between `first` and `last`.
         p : ndarray
             Parameters.
+        trials : int, optional
+            Maximum number of steps, those that are too long included.
 
         Raises
         ------
@@ -200,7 +211,7 @@ class FlatMaps:
         flag = path(first)
         slopes = self.slopes(z, p)
         sign = np.linalg.slogdet(slopes)[0]
-        while place < last:
+        for _ in range(trials):
             step = min(step, last - place)
             goal = path(place + step)
             found = self._stepped(z, goal, flag, slopes, sign, p)
@@ -211,9 +222,11 @@ class FlatMaps:
                 continue
             z, slopes = found
             flag = goal
-            place = last if place + step >= last else place + step
+            if place + step >= last:
+                return z
+            place += step
             step *= 2.0
-        return z
+        raise self._singular(z, place, p)
 
     def followed_simply(self, z: Array, flag: Array, goal: Array, p: Array) -> Array | None:
         """State at the next flag if one step reaches it; otherwise None."""

@@ -143,6 +143,8 @@ def _builder(system: Any) -> tuple[Callable[..., Any], list[str], list[str], boo
     if dataclasses.is_dataclass(system) and not isinstance(system, type):
         names = [field.name for field in dataclasses.fields(system) if field.init]
         return (lambda **values: replace(system, **values)), names, [], False
+    if not isinstance(system, type) and hasattr(system, "with_params"):
+        return (lambda **values: system.with_params(values)), list(system.params), [], False
     made = any(hasattr(system, kind) for kind in ("quantities_of", "ninputs"))
     if isinstance(system, type) or (callable(system) and not made):
         try:
@@ -156,8 +158,8 @@ def _builder(system: Any) -> tuple[Callable[..., Any], list[str], list[str], boo
         required = [p.name for p in named if p.default is p.empty]
         return system, [p.name for p in named], required, any(p.kind is p.VAR_KEYWORD for p in parameters)
     raise TypeError(
-        "with params, system must be a plant with parameters by name (as Crane has), or a function that takes them by "
-        f"keyword and returns a loop or a flat system, got {_name(system)}"
+        "with params, system must be a plant with parameters by name (as Crane has), a flat system from equations, or "
+        f"a function that takes them by keyword and returns a loop or a flat system, got {_name(system)}"
     )
 
 

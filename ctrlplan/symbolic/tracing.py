@@ -5,8 +5,10 @@ A trace is valid only if it agrees with Python.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import casadi as ca
@@ -34,6 +36,9 @@ _AGAIN = 3
 
 _FEWEST = 8
 """Minimum number of points with finite values for a comparison."""
+
+_PACKAGES = tuple(str(Path(file).parent) for file in (__file__, ca.__file__, ct.__file__, np.__file__))
+"""Folders of the code that calls a block, or that it calls."""
 
 
 class NotTraceableError(ValueError):
@@ -173,7 +178,8 @@ def _known(block: Traceable, points: list[Point]) -> list[tuple[Point, Answer]]:
         )
     known = [(point, found) for point, found in zip(points, first, strict=True) if found is not None]
     if len(known) < _FEWEST:
-        raise NotTraceableError(f"block {block.name} cannot be checked: it is finite at too few states")
+        why = next((f": {said}" for point in points if (said := _error_of(block, point))), "")
+        raise NotTraceableError(f"block {block.name} cannot be checked: it is finite at too few states{why}")
     return known
 
 
@@ -187,8 +193,7 @@ def _agreed(block: Traceable, values: Params, known: list[tuple[Point, Answer]])
         try:
             trace = _trace(block, values, symbols)
         except (Exception, SystemExit) as error:  # any exception of a block for symbols
-            lines = str(error).strip().splitlines() or [""]
-            why = why or f"{type(error).__name__}: {lines[-1]:.120}"
+            why = why or _described(error)
             continue
         wrong = _disagreement(trace, known)
         if not wrong:
@@ -198,6 +203,28 @@ def _agreed(block: Traceable, values: Params, known: list[tuple[Point, Answer]])
         f"block {block.name} cannot be traced ({why}); use functions of numpy, as np.sin, np.maximum and np.where, "
         "and lists of values, instead of functions of math, branches on a state, or arrays that are filled"
     )
+
+
+def _error_of(block: Traceable, point: Point) -> str:
+    """Error of a block at a point; empty without one."""
+    t, x, u, values = point
+    try:
+        for function in (block.output(values), block.update(values)):
+            function(t, x.copy(), u.copy())
+    except (Exception, SystemExit) as error:  # any exception of a block
+        return _described(error)
+    return ""
+
+
+def _described(error: BaseException) -> str:
+    """Kind and message of an error, and the line of the user's code from which it comes."""
+    lines = str(error).strip().splitlines() or [""]
+    said = f"{type(error).__name__}: {lines[-1]:.120}"
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(_PACKAGES)]
+    if not own:
+        return said
+    line = f": {own[-1].line}" if own[-1].line else ""
+    return f"{said}, in {Path(own[-1].filename).name}, line {own[-1].lineno}{line}"
 
 
 def _points(values: Params, t: float, x: Array, u: Array) -> Iterator[Point]:

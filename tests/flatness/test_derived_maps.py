@@ -483,3 +483,33 @@ def test_grids_of_plans_with_axes_in_another_order_are_kept():
     np.testing.assert_allclose(x, [1.0, 0.0, 0.0], atol=1e-14)
     assert flat.matched(plan) is flat.matched(plan)
     assert plan.labels == ("y", "x")
+
+
+def test_other_values_of_parameters():
+    """A crane with another load: that of the maps by formulas, for all that python-control calls as well."""
+    crane, heavy = cp.plants.Crane(), cp.plants.Crane(load_mass=700.0)
+    flat = cp.flat_system(crane.iosystem(), ["x", "z"], at={"R": 10.0})
+    changed, known = flat.with_params({"load_mass": 700.0}), heavy.flat_system()
+    plan = rest_to_rest(["x", "z"], [4, 4], [20.0, 11.0], 15.0, [0.0, 10.0])
+    x, u = known.states_and_inputs(plan, 4.0)
+    for got, wanted in zip(changed.states_and_inputs(plan, 4.0), (x, u), strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-10)
+    np.testing.assert_allclose(changed.dynamics(0.0, x, u), known.dynamics(0.0, x, u), rtol=1e-12, atol=1e-12)
+    again = changed.reverse(changed.forward(x, u))
+    np.testing.assert_allclose(again[0], x, rtol=1e-12, atol=1e-12)
+    assert (flat.params["load_mass"], changed.params["load_mass"]) == (crane.load_mass, 700.0)
+    with pytest.raises(ValueError, match="among the parameters of crane"):
+        flat.with_params({"load": 700.0})
+
+
+@pytest.mark.slow
+def test_margins_over_ranges_of_parameters():
+    flat = cp.flat_system(cp.plants.Crane().iosystem(), ["x", "z"], at={"R": 10.0})
+    plan = rest_to_rest(["x", "z"], [4, 4], [20.0, 11.0], 15.0, [0.0, 10.0])
+    limits, params = {"C": (-1500.0, 0.0)}, {"load_mass": (400.0, 600.0), "gravity": 9.81}
+    found = cp.margins(plan, limits, flat, params=params)
+    known = cp.margins(plan, limits, cp.plants.Crane(), params=params)
+    assert found.active.parameters == {"load_mass": 600.0}
+    assert found.active.fraction == pytest.approx(known.active.fraction, rel=1e-8)
+    with pytest.raises(ValueError, match="params must be among"):
+        cp.margins(plan, limits, flat, params={"load": 1.0})

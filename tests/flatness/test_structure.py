@@ -1,5 +1,7 @@
 """Orders, extension and verdict of plants of textbooks, in any units; messages for plants that are not flat."""
 
+import math
+
 import control as ct
 import numpy as np
 import pytest
@@ -303,3 +305,31 @@ def test_inputs_that_are_not_controls_and_parameters_have_different_names():
     )
     with pytest.raises(ValueError, match="names of parameters, got wind of plant"):
         cp.flat_system(plant, "v", inputs="F")
+
+
+def _by_math(t, x, u, p):
+    return [math.sin(x[0]) + u[0]]
+
+
+def _by_branch(t, x, u, p):
+    if x[0] > 0.0:
+        return [u[0]]
+    return [2.0 * u[0]]
+
+
+def _without_parameter(t, x, u, p):
+    return [p["k"] * x[0] + u[0]]
+
+
+@pytest.mark.parametrize(
+    ("update", "line"),
+    [
+        (_by_math, r"TypeError.* in test_structure\.py, line \d+: return \[math\.sin"),
+        (_by_branch, r"branch on a signal.* line \d+: if x\[0\] > 0\.0:"),
+        (_without_parameter, r"KeyError: 'k', in test_structure\.py, line \d+: return \[p\["),
+    ],
+)
+def test_blocks_that_cannot_be_traced_are_named_with_the_line(update, line):
+    plant = ct.nlsys(update, None, states=["x"], inputs=["u"], name="plant")
+    with pytest.raises(ValueError, match=f"block plant cannot be .*{line}"):
+        cp.flat_system(plant, "x")
