@@ -75,8 +75,9 @@ class PlansByDuration:
     def margins(self, duration: float) -> Margins | None:
         """Margins over the whole plan; None if it is infeasible for the plant."""
         if duration not in self._known:
+            plan = self.plan(duration)
             try:
-                self._known[duration] = self.limited.margins(self.plan(duration))
+                self._known[duration] = self.limited.margins(plan)
             except ValueError:
                 self._known[duration] = None
         return self._known[duration]

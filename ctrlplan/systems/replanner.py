@@ -360,6 +360,7 @@ class _Correction(SampledBlock):
             trigger,
             limits,
         )
+        self._bounds = self._bounds_of(horizons.whole) if limits else None
         self._passed, self._naxes, self._order = signals.passed, naxes, order
         self._final = plan.final.tolist()
         self._goal, self._fitted = slice(5, 5 + ngoals), fitted
@@ -474,6 +475,8 @@ class _Correction(SampledBlock):
 
     def _within_limits(self, t: float, found: Transition, coefficients: Array, goal: Array) -> bool:
         """Whether the plan with a correction satisfies the limits until the end of both."""
+        if self._is_bounded(found, coefficients, goal):
+            return True
         met = self._horizons.end(t)
         end = max(met, self._plan.end)
         edges = np.unique([t, met, end, *self._plan.breakpoints.tolist()])
@@ -493,6 +496,31 @@ class _Correction(SampledBlock):
                 if (np.abs(jet(times, nu)[nu]).max(axis=1) > limit * (1.0 + 1e-9)).any():
                     return False
         return True
+
+    def _is_bounded(self, found: Transition, coefficients: Array, goal: Array) -> bool:
+        """Whether bounds of the plan and of the correction satisfy the limits together."""
+        bounds = self._bounds if found is self._horizons.whole else self._bounds_of(found)
+        if bounds is None or goal[1:].any():
+            return False
+        matrix, room = bounds
+        if (np.abs(matrix @ coefficients) > room).any():
+            return False
+        # After the end of the correction the plan is shifted to the goal.
+        position = dict(self._limits).get(0)
+        shift = np.abs(goal[0] - self._plan.final) if len(goal) else 0.0
+        return position is None or bool((shift + self._plan.peak(0) <= position).all())
+
+    def _bounds_of(self, found: Transition) -> tuple[Array, Array] | None:
+        """Matrix from coefficients to values that enclose limited derivatives, and bounds of these values."""
+        matrices, rooms = [], []
+        for nu, limit in self._limits:
+            matrix = found.enclosure(nu)
+            if matrix is None:
+                return None
+            matrices.append(matrix)
+            # What the plan leaves of the limit, with half of the tolerance for rounding.
+            rooms.append(np.tile(limit * (1.0 + 0.5e-9) - self._plan.peak(nu), (len(matrix), 1)))
+        return np.concatenate(matrices), np.concatenate(rooms)
 
     def _output(self, t: Value, x: Value, u: Value, params: Params) -> Array:
         added = itertools.chain.from_iterable(self._corrections(t, x, self._signals.output_order))

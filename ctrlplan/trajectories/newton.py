@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 from scipy.linalg import blas
 
 from ctrlplan._types import Value
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
 from ctrlplan.trajectories.fields import Fields
@@ -508,6 +509,20 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: in
             )
         spread = spread + basis[:, count:] @ free
     return np.asfortranarray(triangle), spread
+
+
+@lru_cache(maxsize=128)
+def basis_proxy(system: NewtonSystem, low: int, high: int) -> Array | None:
+    """Chebyshev coefficients (high - low + 1, size, nterms) of derivatives of the basis on the unit interval.
+
+    None where they are not resolved.
+    """
+
+    def jet(u: Array, order: int) -> Array:
+        return system.taylor(u, order).transpose(1, 0, 2) * FACTORIALS[: order + 1, None, None]
+
+    found = chebyshev_proxy(jet, (0.0, 1.0), low, high)
+    return None if found is None else readonly(found)
 
 
 @lru_cache(maxsize=256)

@@ -13,7 +13,7 @@ from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale, readonly
 from ctrlplan.trajectories.conjugate import SHORT, Kind, segment_system
 from ctrlplan.trajectories.fields import Fields
-from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
+from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, basis_proxy
 
 _AMPLIFIED = 1e4
 """Amplification of rounding errors above which each segment is fitted with a check of its accuracy."""
@@ -99,6 +99,12 @@ class Pieces(Fields):
         """Taylor series by axis at one relative time, a number."""
         run = self.runs[0] if len(self.runs) == 1 else self.run(segment)
         return run.system.series_at(run.coefficients[:, :, segment - run.first].T.tolist(), u, order)
+
+    def proxy(self, segment: int, low: int, high: int) -> Array | None:
+        """Chebyshev coefficients (high - low + 1, naxes, nterms) by relative time in a segment; None if unresolved."""
+        system, coefficients = self.of_segment(segment)
+        basis = basis_proxy(system, low, high)
+        return None if basis is None else np.asarray(coefficients.T @ basis)
 
     def at(self, segment: int, u: Value, order: int) -> list[list[Value]]:
         """Taylor series by axis at one relative time, a number or a symbol."""

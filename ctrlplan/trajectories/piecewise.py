@@ -39,7 +39,7 @@ _WITHIN = readonly(np.linspace(0.0, 1.0, 13))
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
-_MANY = 1000
+_MANY = 200
 """Number of times in each segment above which segments are evaluated one after the other."""
 
 
@@ -403,6 +403,20 @@ class PiecewiseSpline(WaypointSpline):
         out = np.empty((order + 1, self.naxes, u.size))
         for pieces in self._pieces:
             out[:, list(pieces.axes)] = pieces.jet(segment, u, order) * scale
+        return out
+
+    def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
+        duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
+        powers = duration ** -np.arange(low, high + 1.0)[:, None, None]
+        found = [pieces.proxy(segment, low, high) for pieces in self._pieces]
+        known = [proxy * powers for proxy in found if proxy is not None]
+        if len(known) < len(found):
+            return super()._segment_proxy(segment, low, high)
+        if len(known) == 1:
+            return known[0]
+        out = np.zeros((high - low + 1, self.naxes, max(proxy.shape[2] for proxy in known)))
+        for pieces, proxy in zip(self._pieces, known, strict=True):
+            out[:, list(pieces.axes), : proxy.shape[2]] = proxy
         return out
 
     def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:

@@ -130,9 +130,17 @@ def stationary_places(groups: Iterable[Sequence[Polynomials]], durations: Array,
     return chosen, np.concatenate(times) * durations[chosen]
 
 
+@lru_cache(maxsize=128)
+def bernstein(basis: Basis, nu: int) -> Array:
+    """Bernstein coefficients (nparts, degree + 1, size) of a derivative of the basis by relative time."""
+    degree = max(basis.size - 1 - nu, 0)
+    powers = _powers(basis, np.arange(_PARTS) / _PARTS, nu, 1.0 / _PARTS)
+    return readonly(bernstein_of_powers(degree) @ powers)
+
+
 def _bounds(run: Polynomials, durations: Array, nu: int) -> tuple[Array, Array, Array, Array]:
     """Bounds of a derivative, and its extrema at the ends of the parts, each of shape (naxes, nsegments)."""
-    matrix, scale = _bernstein(run.basis, nu), durations**-nu
+    matrix, scale = bernstein(run.basis, nu), durations**-nu
     values = np.tensordot(matrix, run.coefficients, 1) * scale
     rounding = _ROUNDING * scale * np.tensordot(np.abs(matrix), np.abs(run.coefficients), 1).max(axis=(0, 1))
     ends = values[:, [0, -1]]
@@ -142,14 +150,6 @@ def _bounds(run: Polynomials, durations: Array, nu: int) -> tuple[Array, Array, 
         ends.min(axis=(0, 1)),
         ends.max(axis=(0, 1)),
     )
-
-
-@lru_cache(maxsize=128)
-def _bernstein(basis: Basis, nu: int) -> Array:
-    """Bernstein coefficients (nparts, degree + 1, size) of a derivative of the basis by relative time."""
-    degree = max(basis.size - 1 - nu, 0)
-    powers = _powers(basis, np.arange(_PARTS) / _PARTS, nu, 1.0 / _PARTS)
-    return readonly(bernstein_of_powers(degree) @ powers)
 
 
 @lru_cache(maxsize=128)

@@ -1,10 +1,11 @@
 """Evaluation of analytic functions at many times from exact jets at few.
 
-Sorted times are divided into cells. In each cell the Taylor series about its
-centre, from the exact jet there, gives the values: by one matrix product for
-all cells if the times are evenly spaced, otherwise by one per cell. For unsorted
-times a Chebyshev interpolant of each derivative is built from exact jets. All
-are as accurate as the jets: series are truncated below rounding.
+A Chebyshev interpolant of each derivative is built from exact jets, once for a
+segment, and evaluated by matrix products. Very many sorted times are divided into
+cells. In each cell the Taylor series about its centre, from the exact jet there,
+gives the values: by one matrix product for all cells if the times are evenly
+spaced, otherwise by one per cell. All are as accurate as the jets: series are
+truncated below rounding.
 """
 
 from __future__ import annotations
@@ -14,53 +15,81 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy
 from ctrlplan.trajectories.common import FACTORIALS, Array
 
 if TYPE_CHECKING:
     from ctrlplan.trajectories.trajectory import Trajectory
 
-FEW = 4096
+FEW = 256
 """Number of times up to which the jets themselves are evaluated."""
+
+_CELLS = 30_000
+"""Number of sorted times from which cells are faster than an interpolant with many terms."""
+
+_SHORT = 14
+"""Number of terms of an interpolant that is faster than cells."""
 
 _MAX_TERMS = 24
 _PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
 _CHUNK = 4104  # not a power of two, to avoid cache conflicts between rows
 
 
-def sample(jet: Callable[[Array, int], Array], duration: float, t: Array, low: int, high: int) -> Array:
-    """Derivatives low to high at many times.
+def sample(
+    jet: Callable[[Array, int], Array],
+    proxy: Array | None,
+    duration: float,
+    t: Array,
+    orders: tuple[int, int],
+    out: Array,
+) -> None:
+    """Derivatives at many times.
 
     Parameters
     ----------
     jet : callable
         Maps times (ntime,) and an order to (order + 1, naxes, ntime).
+    proxy : ndarray or None
+        Chebyshev coefficients of the derivatives, from `chebyshev_proxy`.
     duration : float
         Length [s] of the segment, from 0, in which the function is analytic.
     t : ndarray, shape (ntime,)
         Times [s] in that segment.
-    low, high : int
-        Orders of the derivatives.
-
-    Returns
-    -------
-    ndarray, shape (high - low + 1, naxes, ntime)
+    orders : (int, int)
+        Lowest and highest order of the derivatives.
+    out : ndarray, shape (norders, naxes, ntime)
+        Place of the result.
     """
+    if (proxy is None or t.size > (_CELLS if proxy.shape[2] > _SHORT else 10 * _CELLS)) and _sample_cells(
+        jet, duration, t, orders, out
+    ):
+        return
+    if proxy is None:
+        _sample_chunks(jet, t, orders, out)
+    else:
+        _sample_proxy(proxy, duration, t, out)
+
+
+def _sample_cells(
+    jet: Callable[[Array, int], Array], duration: float, t: Array, orders: tuple[int, int], out: Array
+) -> bool:
+    """Derivatives at sorted times by Taylor series in cells; False if times are not sorted, or series too long."""
+    low, high = orders
     size = np.abs(jet(np.linspace(0.0, duration, 9), high + _MAX_TERMS + 2)).max(axis=2)
     if _is_uniform(t, duration):
         step = float(t[-1] - t[0]) / (t.size - 1)
         for cell in (2048, 1024, 512, 256, 128, 64):
             terms = _taylor_terms(size, 0.5 * cell * step, low, high)
             if terms is not None:
-                return _sample_uniform(jet, float(t[0]), step, t.size, low, high, cell, terms)
+                _sample_uniform(jet, float(t[0]), step, cell, terms, low, out)
+                return True
     elif t[-1] > t[0] and bool(np.all(t[1:] >= t[:-1])):
         for cell in (4096, 2048, 1024, 512, 256):
             ncells = -(-t.size // cell)
             terms = _taylor_terms(size, 0.5 * float(t[-1] - t[0]) / ncells, low, high)
             if terms is not None:
-                return _sample_sorted(jet, t, ncells, low, high, terms)
-    proxy = chebyshev_proxy(jet, (0.0, duration), low, high)
-    return _sample_chunks(jet, t, low, high) if proxy is None else _sample_proxy(proxy, duration, t)
+                _sample_sorted(jet, t, ncells, terms, low, out)
+                return True
+    return False
 
 
 def sample_in_batches(plan: Trajectory, t: Array, low: int, high: int, left: bool) -> Array:
@@ -113,44 +142,36 @@ def _taylor_terms(size: Array, radius: float, low: int, high: int) -> int | None
 
 
 def _sample_uniform(
-    jet: Callable[[Array, int], Array],
-    first: float,
-    step: float,
-    count: int,
-    low: int,
-    high: int,
-    cell: int,
-    terms: int,
-) -> Array:
+    jet: Callable[[Array, int], Array], first: float, step: float, cell: int, terms: int, low: int, out: Array
+) -> None:
+    norders, naxes, count = out.shape
     ncells = count // cell
     centres = first + step * (0.5 * (cell - 1) + cell * np.arange(ncells + 1, dtype=float))
-    jets = jet(centres, high + terms - 1)
+    jets = jet(centres, low + norders + terms - 2)
     radius = 0.5 * cell * step
     powers = np.linspace(-1.0 + 1.0 / cell, 1.0 - 1.0 / cell, cell) ** np.arange(terms)[:, None]
     scale = radius ** np.arange(terms) / FACTORIALS[:terms]
-    out = np.empty((high - low + 1, jets.shape[1], count))
     main = ncells * cell
     block = max(1, _PRODUCT // (terms * cell))
-    for row in range(high - low + 1):
+    for row in range(norders):
         table = np.ascontiguousarray(np.moveaxis(jets[low + row : low + row + terms], 0, -1) * scale)
-        for axis in range(jets.shape[1]):
+        for axis in range(naxes):
             whole = out[row, axis, :main].reshape(ncells, cell)
             for begin in range(0, ncells, block):
                 np.matmul(table[axis, begin : min(begin + block, ncells)], powers, out=whole[begin : begin + block])
             if main < count:
                 np.matmul(table[axis, ncells], powers[:, : count - main], out=out[row, axis, main:])
-    return out
 
 
-def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, low: int, high: int, terms: int) -> Array:
+def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, terms: int, low: int, out: Array) -> None:
+    norders, naxes, _ = out.shape
     edges: Array = np.linspace(t[0], t[-1], ncells + 1)
     centres, radius = 0.5 * (edges[:-1] + edges[1:]), 0.5 * float(t[-1] - t[0]) / ncells
-    jets = jet(centres, high + terms - 1)
-    naxes = jets.shape[1]
+    jets = jet(centres, low + norders + terms - 2)
     scale = radius ** np.arange(terms) / FACTORIALS[:terms]
-    table = np.stack([np.moveaxis(jets[nu : nu + terms], 0, -1) for nu in range(low, high + 1)]) * scale
+    table = np.stack([np.moveaxis(jets[nu : nu + terms], 0, -1) for nu in range(low, low + norders)]) * scale
     table = np.moveaxis(table, 2, 0).reshape(ncells, -1, terms)
-    out = np.empty(((high - low + 1) * naxes, t.size))
+    flat = out.reshape(norders * naxes, t.size)  # a view
     bounds = np.searchsorted(t, edges[1:-1]).tolist()
     for k, (first, last) in enumerate(zip([0, *bounds], [*bounds, t.size], strict=True)):
         if first < last:
@@ -159,17 +180,15 @@ def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, lo
             x = (t[first:last] - centres[k]) / radius
             for n in range(1, terms):
                 np.multiply(powers[n - 1], x, out=powers[n])
-            np.matmul(table[k], powers, out=out[:, first:last])
-    return out.reshape(high - low + 1, naxes, t.size)
+            np.matmul(table[k], powers, out=flat[:, first:last])
 
 
-def _sample_proxy(coefficients: Array, duration: float, t: Array) -> Array:
+def _sample_proxy(coefficients: Array, duration: float, t: Array, out: Array) -> None:
     nrows, naxes, size = coefficients.shape
-    flat = coefficients.reshape(nrows * naxes, size)
-    out = np.empty((nrows * naxes, t.size))
+    flat, target = coefficients.reshape(nrows * naxes, size), out.reshape(nrows * naxes, t.size)  # views
     middle = radius = 0.5 * duration
     part = max(1, min(_CHUNK, _PRODUCT // flat.size))
-    basis = np.empty((max(size, 2), _CHUNK))
+    basis = np.empty((max(size, 2), min(_CHUNK, t.size)))
     basis[0] = 1.0
     for first in range(0, t.size, _CHUNK):
         x = (t[first : first + _CHUNK] - middle) / radius
@@ -184,14 +203,9 @@ def _sample_proxy(coefficients: Array, duration: float, t: Array) -> Array:
             top += more
         for begin in range(0, x.size, part):
             end = min(begin + part, x.size)
-            np.matmul(flat, terms[:size, begin:end], out=out[:, first + begin : first + end])
-    return out.reshape(nrows, naxes, t.size)
+            np.matmul(flat, terms[:size, begin:end], out=target[:, first + begin : first + end])
 
 
-def _sample_chunks(jet: Callable[[Array, int], Array], t: Array, low: int, high: int) -> Array:
-    first = jet(t[:_CHUNK], high)[low:]
-    out = np.empty((*first.shape[:2], t.size))
-    out[:, :, :_CHUNK] = first
-    for begin in range(_CHUNK, t.size, _CHUNK):
-        out[:, :, begin : begin + _CHUNK] = jet(t[begin : begin + _CHUNK], high)[low:]
-    return out
+def _sample_chunks(jet: Callable[[Array, int], Array], t: Array, orders: tuple[int, int], out: Array) -> None:
+    for begin in range(0, t.size, _CHUNK):
+        out[:, :, begin : begin + _CHUNK] = jet(t[begin : begin + _CHUNK], orders[1])[orders[0] :]

@@ -23,6 +23,7 @@ from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories import extrema as _extrema
 from ctrlplan.trajectories import sampling as _sampling
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.continuity import Jump, find_jumps
 from ctrlplan.trajectories.fields import Fields
@@ -1099,24 +1100,56 @@ class Trajectory(Displayed, Fields, ABC):
             else:
                 where = np.flatnonzero(segments == segment)
             if 0 <= segment < nsegments:
-                out[:, :, where] = self._sample_segment(segment, t[where] - self.breakpoints[segment], low, high)
+                part = t[where] - self.breakpoints[segment]
+                if in_order:
+                    self._sample_segment(segment, part, low, high, out[:, :, where])
+                else:
+                    out[:, :, where] = self._sample_segment(segment, part, low, high)
             elif low == 0:
                 out[0][:, where] = (self.initial if segment < 0 else self.final)[:, None]
         return out
 
-    def _sample_segment(self, segment: int, s: Array, low: int, high: int) -> Array:
+    def _sample_segment(self, segment: int, s: Array, low: int, high: int, out: Array | None = None) -> Array:
+        """Derivatives low to high of a segment, in a part of the result if it is given."""
         duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
         if abs(math.log10(duration)) * high > 200.0:
-            return self._extreme_jet(segment, s, low, high)
+            return _placed(self._extreme_jet(segment, s, low, high), out)
         with np.errstate(over="ignore", invalid="ignore"):
             if s.size <= _sampling.FEW:
-                found = self.segment_jet(segment, s, high)[low:]
+                found = _placed(self.segment_jet(segment, s, high)[low:], out)
             else:
-                found = _sampling.sample(lambda u, order: self.segment_jet(segment, u, order), duration, s, low, high)
+                found = np.empty((high - low + 1, self.naxes, s.size)) if out is None else out
+                self._sample_many(segment, s, low, found)
             suspect = not np.isfinite(found.sum())
         if suspect:
             self._check_finite(found, segment, high)
         return found
+
+    def _sample_many(self, segment: int, s: Array, low: int, out: Array) -> None:
+        """Derivatives from an order on, as many as `out` has rows, at many times of a segment."""
+
+        def jet(u: Array, order: int) -> Array:
+            return self.segment_jet(segment, u, order)
+
+        high = low + len(out) - 1
+        known, key = self._proxies, (segment, low, high)
+        if key not in known:
+            known[key] = self._segment_proxy(segment, low, high)
+        length = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
+        _sampling.sample(jet, known[key], length, s, (low, high), out)
+        for k in (0, -1):  # the ends have the entries of waypoints in every bit
+            if s[k] in (0.0, length):
+                out[:, :, k] = jet(s[[k]], high)[low:, :, 0]
+
+    @cached_property
+    def _proxies(self) -> dict[tuple[int, int, int], Array | None]:
+        """Chebyshev coefficients of derivatives, by segment, lowest and highest order."""
+        return {}
+
+    def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
+        """Chebyshev coefficients (high - low + 1, naxes, size) of derivatives on a segment; None if unresolved."""
+        length = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
+        return chebyshev_proxy(lambda u, order: self.segment_jet(segment, u, order), (0.0, length), low, high)
 
     def _extreme_jet(self, segment: int, s: Array, low: int, high: int) -> Array:
         """Derivatives low to high of a segment whose duration to the power of their order overflows."""
@@ -1208,6 +1241,14 @@ def check_end(plan: Trajectory, name: str = "plan") -> None:
             f"{name} must have an end, got a plan that repeats for all future times; use the part that repeats (its "
             "attribute `plan`), or a number of repetitions of it by `repeat`"
         )
+
+
+def _placed(values: Array, out: Array | None) -> Array:
+    """Values, copied into a part of a result if it is given."""
+    if out is None:
+        return values
+    out[...] = values
+    return out
 
 
 def _no_rows(*_given: object) -> None:

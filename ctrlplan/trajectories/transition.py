@@ -15,8 +15,12 @@ from ctrlplan._types import Value
 from ctrlplan.trajectories.chosen import checked_alpha
 from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale
 from ctrlplan.trajectories.fields import Fields
-from ctrlplan.trajectories.newton import NewtonSystem
+from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.one_time import newton_series, pair_series
+from ctrlplan.trajectories.piecewise_extrema import bernstein
+
+_AMPLIFIED = 1e4
+"""Amplification of rounding errors above which the coefficients are found by a triangular solution."""
 
 
 class Transition(Displayed, Fields):
@@ -66,6 +70,8 @@ class Transition(Displayed, Fields):
     rate: float
     _system: NewtonSystem
     _rows: NDArray[np.intp]
+    _matrix: Array | None  # from scaled jets without the position at the start to scaled coefficients
+    _jet_scale: Array
     _data_scale: Array
     _time_scale: Array
 
@@ -87,6 +93,8 @@ class Transition(Displayed, Fields):
             rate=alpha / horizon,
             _system=family.system,
             _rows=family.rows,
+            _matrix=family.matrix,
+            _jet_scale=(powers[family.jet_orders] * family.jet_inverse)[:, None],
             _data_scale=(powers[family.system.order_index] * family.inverse)[:, None],
             _time_scale=(1.0 / powers)[:, None],
         )
@@ -117,6 +125,12 @@ class Transition(Displayed, Fields):
         -------
         ndarray, shape (2 (order + 1), naxes)
         """
+        if self._matrix is not None:
+            scaled = jets * self._jet_scale
+            scaled[self.order + 1] -= scaled[0]  # relative to the start, as in `NewtonSystem.coefficients`
+            found = self._matrix @ scaled[1:]
+            found[0] += scaled[0]
+            return np.asarray(found * self._time_scale)
         data = jets[self._rows]
         found = self._system.fitted(data, (0.0, self.horizon), self.horizon, data * self._data_scale)
         return found * self._time_scale
@@ -126,6 +140,17 @@ class Transition(Displayed, Fields):
         taylor = self._system.taylor(np.asarray(s, dtype=float) / self.horizon, order)
         values = np.einsum("mkt,ma->kat", taylor, coefficients / self._time_scale)
         return values * derivative_scale(self.horizon, order)[:, None, None]
+
+    def enclosure(self, nu: int) -> Array | None:
+        """Matrix from coefficients to values whose extremes enclose the nu-th derivative.
+
+        Of shape (nvalues, 2 (order + 1)): Bernstein coefficients on parts of the
+        horizon. None if `alpha` is not 0.
+        """
+        if self.alpha:
+            return None
+        matrix = bernstein(self._system, nu)
+        return np.asarray(matrix.reshape(-1, matrix.shape[-1]) * (self.horizon**-nu / self._time_scale[:, 0]))
 
     def evaluation(self, s: float, order: int) -> Array:
         """Matrix from coefficients to derivatives at one time s [s].
@@ -157,6 +182,9 @@ class _Family(NamedTuple):
     rows: NDArray[np.intp]  # of the jets at both ends, in the order of the system
     exponents: Array
     inverse: Array  # of the factorials
+    jet_orders: NDArray[np.intp]  # of the jets at both ends
+    jet_inverse: Array  # of their factorials
+    matrix: Array | None  # from Taylor data of the jets, without the first, to coefficients; None if that loses digits
 
 
 @lru_cache(maxsize=4096)
@@ -165,7 +193,12 @@ def _family(order: int, alpha: float) -> _Family:
     given = tuple(range(order + 1))
     system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
     rows = system.waypoint_index * (order + 1) + system.order_index
-    return _Family(system, rows, np.arange(2.0 * order + 2.0), 1.0 / FACTORIALS[system.order_index])
+    matrix = None
+    if system.amplification < _AMPLIFIED and alpha < NEARLY_CLOSED:
+        matrix = system.coefficients(np.eye(len(rows)))[:, np.argsort(rows)[1:]].copy()
+    exponents, inverse = np.arange(2.0 * order + 2.0), 1.0 / FACTORIALS[system.order_index]
+    orders = np.arange(2 * order + 2) % (order + 1)
+    return _Family(system, rows, exponents, inverse, orders, 1.0 / FACTORIALS[orders], matrix)
 
 
 @lru_cache(maxsize=4096)

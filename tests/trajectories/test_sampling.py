@@ -13,7 +13,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
 
 EPS = np.finfo(float).eps
 ALPHAS = [0.0, 0.3, 1.0, 3.0, 5.5]
-COUNTS = [4097, 4500, 5000, 6500, 20_000, 100_000]
+COUNTS = [257, 1000, 4097, 4500, 5000, 6500, 20_000, 100_000]
 
 
 def random_plan(size, alpha, kind=TrigSpline, naxes=1):
@@ -40,7 +40,7 @@ def swinging(size):
 
 
 def few_at_a_time(plan, t, order):
-    return np.concatenate([plan.jet(part, order) for part in np.array_split(t, -(-t.size // 1000))], axis=2)
+    return np.concatenate([plan.jet(part, order) for part in np.array_split(t, -(-t.size // 250))], axis=2)
 
 
 def disagreement(plan, t, order=2, tolerance=1e-13):
