@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import trapezoid
-from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -21,6 +20,7 @@ from ctrlplan._display import Displayed, Facts, Figure, Part, title_of
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope
 from ctrlplan.planning.clearance import clearance as certified_clearance
+from ctrlplan.planning.inequalities import minimised
 from ctrlplan.planning.objectives import plan_length
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import PiecewiseSpline, Trajectory, Waypoint, WaypointSpline
@@ -28,7 +28,7 @@ from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.trajectory import check_end
 from ctrlplan.trajectories.waypoint import waypoint_table
 
-Build = Callable[[Iterable[Waypoint]], Trajectory]
+Build = Callable[[Iterable[Waypoint]], WaypointSpline]
 Pairs = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
@@ -36,10 +36,12 @@ _MAXIMUM_CLASSES = 3  # maximum number of homotopy classes that are tried,
 _DETOUR = 1.5  # with lengths up to this multiple of the shortest path
 _LONG = 2.0  # length relative to the shortest path above which a warning is issued
 _SAMPLES = 257
-_WINDOW = 8  # samples per constraint, which is on their minimum
-_TRIES = 3  # optimisations with the same via points and increasing margins
+_WINDOW = 8  # samples per constraint, which is on their minimum,
+_FINE = 4  # with finer ones in between
+_POINTS = 4  # maximum number of via points, or one more than there are corners
+_TRIES = 8  # optimisations with the same via points and further samples
+_WIDER = 0.01  # extra clearance of a second path, relative to the path length
 _STEP = 1e-7  # step of finite differences, for unknowns of magnitude 1
-_PRICE = 3e2  # penalty of a clearance violation of one path length, relative to the initial roughness
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,7 +110,7 @@ def avoid(
     clearance: float = 0.0,
     load: float = 0.0,
     rope: Rope | None = None,
-    max_points: int = 4,
+    max_points: int | None = None,
 ) -> Avoidance:
     r"""Plan through the same waypoints that avoids obstacles.
 
@@ -141,7 +143,8 @@ def avoid(
         Straight rope, such as `Crane.rope()`, which must have the clearance as
         well.
     max_points : int, optional
-        Maximum number of inserted via points.
+        Maximum number of inserted via points. Default: one more than the shortest
+        path has corners, and at least 4.
 
     Returns
     -------
@@ -182,29 +185,33 @@ def avoid(
         checked_finite(clearance, "clearance", minimum=0.0),
         checked_finite(load, "load", minimum=0.0),
         checked_rope(rope),
-        checked_count(max_points, "max_points", 1),
+        None if max_points is None else checked_count(max_points, "max_points", 1),
     )
     task.check_waypoints()
     if task.given.certified:
         return Avoidance(plan, task.given)
     best = task.given
     spline = _rebuildable(task)
-    polylines = _polylines(task)
     for build in _kinds(spline):
-        found = []
-        for polyline in polylines:
-            reached, certificate = _search(task, build, polyline)
-            if certificate.certified:
-                found.append(Avoidance(reached, certificate))
-            elif certificate.lower > best.minimum:  # larger beyond rounding; in a tie the earlier plan is retained
-                best = certificate
-        if found:
-            smoothest = min(found, key=lambda avoidance: task.roughness(avoidance.plan))
-            _check_length(smoothest.plan, sum(map(_length, polylines[0])))
-            return smoothest
+        # After a near miss again from paths with more clearance.
+        for extra in (0.0, _WIDER * task.size):
+            if extra and task.required - best.minimum > extra:
+                break
+            polylines, found = _polylines(task, extra), []
+            for polyline in polylines:
+                reached, certificate = _search(task, build, polyline)
+                if certificate.certified:
+                    found.append(Avoidance(reached, certificate))
+                elif certificate.lower > best.minimum:  # beyond rounding; in a tie the earlier plan is retained
+                    best = certificate
+            if found:
+                smoothest = min(found, key=lambda avoidance: task.roughness(avoidance.plan))
+                _check_length(smoothest.plan, sum(map(_length, polylines[0])))
+                return smoothest
     x, z = best.position
+    points = "with " if task.max_points is None else f"with {task.max_points} via points or fewer and "
     raise ValueError(
-        f"no plan with {task.max_points} via points or fewer and a clearance of {task.required:g} was found: "
+        f"no plan {points}a clearance of {task.required:g} was found: "
         f"the maximum clearance is {best.minimum:.4g}, of the {best.part} from obstacles[{best.obstacle}] "
         f"with the load at ({x:.4g}, {z:.4g}) at {best.time:.4g} s; the search does not find every plan: "
         f"add waypoints, increase max_points or reduce the clearance"
@@ -230,7 +237,7 @@ class _Task:
     required: float
     load: float
     rope: Rope | None
-    max_points: int
+    max_points: int | None
 
     @cached_property
     def points(self) -> Array:
@@ -348,9 +355,12 @@ def _kinds(plan: WaypointSpline) -> Iterator[Build]:
 # Polylines around the obstacles
 
 
-def _polylines(task: _Task) -> list[list[Array]]:
-    """Shortest polyline of each homotopy class as corners (2, n) by segment, with waypoints; the shortest first."""
-    for margin in ((1.0 + 1e-3) * (task.load + task.required), 0.0):
+def _polylines(task: _Task, extra: float = 0.0) -> list[list[Array]]:
+    """Shortest polyline of each homotopy class as corners (2, n) by segment, with waypoints; the shortest first.
+
+    With the clearance and an extra distance, or without both if there is none.
+    """
+    for margin in ((1.0 + 1e-3) * (task.load + task.required) + extra, 0.0):
         # If the required clearance is impossible, the maximum clearance found is still reported.
         nodes, edges = _visible(task, margin)
         found = {}
@@ -450,16 +460,18 @@ class _Vias:
 
 def _search(task: _Task, build: Build, polyline: list[Array]) -> tuple[Trajectory, Clearance]:
     """Certified plan along a polyline, or the plan of maximum clearance."""
-    vias = _first(task, polyline)
+    vias = _timed(task, build, _first(task, polyline))
+    limit = max(_POINTS, vias.times.size + 1) if task.max_points is None else task.max_points
     best: Trajectory = task.plan
-    nearest = task.given
+    nearest, idle = task.given, 0
     while True:
         plan: Trajectory = task.plan
         found, before = task.given, nearest.minimum
         margin = fine = 3e-4 * task.size
+        extra: list[float] = []
         for _ in range(_TRIES):
-            vias = _moved(task, build, vias, margin)
             try:
+                vias, violation = _moved(task, build, vias, margin, extra)
                 plan = _through(task, build, vias)
                 found = task.certificate(plan)
             except ValueError:  # no plan of this class through these points, or a slack rope
@@ -468,13 +480,14 @@ def _search(task: _Task, build: Build, polyline: list[Array]) -> tuple[Trajector
                 return plan, found
             if found.minimum > nearest.minimum:
                 best, nearest = plan, found
-            missed = task.required - found.minimum
-            if missed > 3.0 * margin:  # more than the error between samples
+            if violation > margin:  # at the samples themselves
                 break
-            margin += 1.5 * max(missed, 0.0)
-        # Stop if an additional via point did not increase the clearance.
-        stuck = found is not task.given and vias.times.size > 1 and nearest.minimum < before + fine
-        if stuck or vias.times.size >= task.max_points:
+            # Between the samples: at a corner the error is of the size of their distance.
+            extra.append(found.time)
+            margin += min(0.3 * max(task.required - found.minimum, 0.0), fine)
+        # Two further via points may be required before the clearance increases.
+        idle = idle + 1 if found is not task.given and nearest.minimum < before + fine else 0
+        if idle > 1 or vias.times.size >= limit:
             return best, nearest
         time = _apart(task, vias, found.time)
         vias = vias.inserted(task, time, plan(time))
@@ -490,7 +503,7 @@ def _first(task: _Task, polyline: list[Array]) -> _Vias:
             steps, chords = np.hypot(*np.diff(line)), np.hypot(*(line[:, 2:] - line[:, :-2]))
             bends |= {(segment, k): bend for k, bend in enumerate((steps[1:] + steps[:-1] - chords).tolist(), 1)}
         minimum = min(bends.values(), default=0.0)
-        if len(bends) < 2 or (len(bends) <= task.max_points and minimum > 0.01 * task.size):
+        if len(bends) < 2 or (len(bends) <= (task.max_points or len(bends)) and minimum > 0.01 * task.size):
             break
         segment, k = min(bends, key=lambda corner: bends[corner])
         lines[segment] = np.delete(lines[segment], k, axis=1)
@@ -515,83 +528,118 @@ def _apart(task: _Task, vias: _Vias, time: float) -> float:
     return float(np.clip(time, 0.9 * a + 0.1 * b, 0.1 * a + 0.9 * b))
 
 
-def _through(task: _Task, build: Build, vias: _Vias) -> Trajectory:
+def _through(task: _Task, build: Build, vias: _Vias) -> WaypointSpline:
+    return build(_points(task, vias))
+
+
+def _points(task: _Task, vias: _Vias) -> list[Waypoint]:
+    """Waypoints with via points, in order of time."""
     added = [Waypoint(t, p) for t, p in zip(vias.times.tolist(), vias.positions.T, strict=True)]
     labels = task.plan.waypoints[0].labels
     if labels is not None:
         added = [Waypoint.from_jets(w.time, **{n: [v] for n, v in zip(labels, w.position, strict=True)}) for w in added]
-    return build(sorted([*task.plan.waypoints, *added], key=lambda w: w.time))
+    return sorted([*task.plan.waypoints, *added], key=lambda w: w.time)
 
 
-def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
-    """Via points of minimum roughness subject to the clearance at samples, or of minimum violation.
+def _moved(task: _Task, build: Build, vias: _Vias, margin: float, extra: Sequence[float]) -> tuple[_Vias, float]:
+    """Via points of minimum roughness subject to the clearance at samples, and the largest violation there.
 
-    The unknowns are the positions in units of the size, the logarithms of the
-    relative durations within a segment (0 for the last one), and the violation of
-    the clearance, a slack variable that makes every step of the search feasible.
+    The unknowns are the positions in units of the size, and the logarithms of the
+    relative durations within a segment (0 for the last one). `extra` are further
+    samples.
     """
-    count = vias.segments.size
-    t = np.linspace(task.plan.start, task.plan.end, _SAMPLES)
-    order = 3 if task.rope is None else max(3, task.rope.order)
-    windows = np.arange(0, t.size, _WINDOW)
-    # At the waypoints themselves the clearance may be just the required one.
-    room = np.abs(t - task.times[:, None]).min(axis=0) / (0.05 * task.plan.duration)
-    required = task.required + margin * np.minimum(1.0, room)
-
-    def jets(x: Array) -> Array:
-        return _through(task, build, _decoded(task, vias, x)).jet(t, order)
-
-    def valued(jet: Array) -> Array:
-        """Roughness, then the clearance in each window: shape (nvalues, ...) from jets (order + 1, 2, ..., ntime)."""
-        rooms = np.minimum.reduceat(task.clearances(jet) - required, windows, axis=-1) / task.size
-        rows = np.moveaxis(rooms, -1, 1).reshape(-1, *jet.shape[2:-1])
-        return np.concatenate([_roughness(t, jet, task.size)[None], rows])
-
-    @lru_cache(maxsize=4)
-    def measured(key: bytes) -> Array:
-        try:
-            return valued(jets(np.frombuffer(key)))
-        except ValueError:  # no plan here: the search steps back
-            return np.append(1e6, np.full(windows.size * task.ngaps, -1e3))
-
-    @lru_cache(maxsize=1)
-    def slopes(key: bytes) -> Array:
-        try:
-            moved = valued(_varied(jets, np.frombuffer(key), count))
-        except ValueError:
-            return np.zeros((measured(key).size, 3 * count))
-        return (moved - measured(key)[:, None]) / _STEP
-
-    logarithms = [_logarithms(task, vias, segment) for segment in np.unique(vias.segments)]
-    start = [vias.positions.ravel() / task.size, *logarithms]
-    x0 = np.append(np.concatenate(start), 0.0)
-    first = measured(x0.tobytes())
-    x0[-1] = max(0.0, -float(first[1:].min()))
-    found = minimize(
-        lambda x: measured(_key(x))[0] / first[0] + _PRICE * x[-1],
-        x0,
-        jac=lambda x: np.append(slopes(_key(x))[0] / first[0], _PRICE),
-        method="SLSQP",
-        bounds=[(None, None)] * (2 * count) + [(-4.0, 4.0)] * count + [(0.0, None)],
-        constraints={
-            "type": "ineq",
-            "fun": lambda x: measured(_key(x))[1:] + x[-1],
-            "jac": lambda x: np.column_stack([slopes(_key(x))[1:], np.ones(first.size - 1)]),
-        },
-        options={"maxiter": 40, "ftol": 1e-5},
-    )
-    return _decoded(task, vias, found.x)
+    x, missed = minimised(_Scene(task, build, vias, margin, extra), _encoded(task, vias))
+    return _decoded(task, vias, x), missed * task.size
 
 
-def _varied(jets: Callable[[Array], Array], x: Array, count: int) -> Array:
-    """Jets after a step along each unknown of `_moved` but the violation, shape (order + 1, 2, 3 count, ntime)."""
-    here, steps = jets(x), _STEP * np.eye(x.size)
-    # The axes of a plan are independent: one plan gives the derivatives along both.
-    both = np.stack([jets(x + steps[i] + steps[count + i]) for i in range(count)], axis=2)
-    along = np.repeat(here[:, :, None], 2 * count, axis=2)
-    along[:, 0, :count], along[:, 1, count:] = both[:, 0], both[:, 1]
-    later = np.stack([jets(x + steps[2 * count + i]) for i in range(count)], axis=2)
-    return np.concatenate([along, later], axis=2)
+def _timed(task: _Task, build: Build, vias: _Vias) -> _Vias:
+    """Via points at the times of minimum roughness: between corners at other times a spline of high degree swings."""
+    scene, x = _Scene(task, build, vias, 0.0, ()), _encoded(task, vias)
+    places = 2 * vias.times.size
+    try:
+        x[places:], _ = minimised(_Times(scene, x[:places]), x[places:], accuracy=1e-2)
+    except ValueError:  # no plan of this class through these points
+        return vias
+    return _decoded(task, vias, x)
+
+
+class _Scene:
+    """Roughness as a sum of squares, and clearances at samples, as functions of the unknowns of `_moved`."""
+
+    def __init__(self, task: _Task, build: Build, vias: _Vias, margin: float, extra: Sequence[float]) -> None:
+        self._task, self._build, self._vias = task, build, vias
+        fine = np.linspace(task.plan.start, task.plan.end, _FINE * (_SAMPLES - 1) + 1)
+        self._times = np.append(fine, extra)
+        self._order = 3 if task.rope is None else max(3, task.rope.order)
+        self._windows = np.append(np.arange(0, fine.size, _FINE * _WINDOW), np.arange(fine.size, self._times.size))
+        # At the waypoints themselves the clearance may be just the required one.
+        room = np.abs(self._times - task.times[:, None]).min(axis=0) / (0.05 * task.plan.duration)
+        self._required = task.required + margin * np.minimum(1.0, room)
+
+    def values(self, x: Array) -> tuple[Array, Array]:
+        """Terms whose squares add up to the roughness, and excess clearances by window, relative to the size.
+
+        Raises
+        ------
+        ValueError
+            If there is no plan through these points.
+        """
+        return self._valued(self._jet(self._plan(x)))
+
+    def slopes(self, x: Array, positions: bool = True) -> tuple[Array, Array]:
+        """Derivatives (nvalues, nunknowns) of both, if wanted by positions also."""
+        count = self._vias.segments.size
+        plan, steps = self._plan(x), _STEP * np.eye(x.size)
+        here = self._jet(plan)
+        moved = []
+        if positions:
+            # The axes of a plan are independent: one plan gives the derivatives along both.
+            both = np.stack(
+                [self._jet(self._plan(x + steps[i] + steps[count + i], plan)) for i in range(count)], axis=2
+            )
+            moved.append(np.repeat(here[:, :, None], 2 * count, axis=2))
+            moved[0][:, 0, :count], moved[0][:, 1, count:] = both[:, 0], both[:, 1]
+        moved.append(np.stack([self._jet(self._plan(x + steps[2 * count + i])) for i in range(count)], axis=2))
+        before, after = self._valued(here), self._valued(np.concatenate(moved, axis=2))
+        return (after[0] - before[0][:, None]) / _STEP, (after[1] - before[1][:, None]) / _STEP
+
+    def _plan(self, x: Array, same_times: WaypointSpline | None = None) -> WaypointSpline:
+        """Plan of some unknowns; another one with the same times makes it faster."""
+        points = _points(self._task, _decoded(self._task, self._vias, x))
+        return self._build(points) if same_times is None else same_times.with_values(points)
+
+    def _jet(self, plan: Trajectory) -> Array:
+        return plan.jet(self._times, self._order)
+
+    def _valued(self, jet: Array) -> tuple[Array, Array]:
+        """As `values`, from jets (order + 1, 2, ..., ntime), with the trailing axis first."""
+        size, duration = self._task.size, self._task.plan.duration
+        weights = np.full(_SAMPLES, duration / (_SAMPLES - 1))
+        weights[[0, -1]] *= 0.5
+        on_grid = jet[..., : _FINE * (_SAMPLES - 1) + 1 : _FINE]
+        speed = np.hypot(on_grid[1, 0], on_grid[1, 1])
+        # Not differentiable at rest: rounded at a small fraction of the mean speed.
+        path = np.sqrt(weights / size * np.hypot(speed, 1e-3 * size / duration))
+        jerk = np.sqrt(weights * duration**5 / (720.0 * size**2)) * on_grid[3]
+        terms = np.moveaxis(np.concatenate([jerk, path[None]]), -1, 1)
+        rooms = np.minimum.reduceat(self._task.clearances(jet) - self._required, self._windows, axis=-1) / size
+        return tuple(rows.reshape(-1, *jet.shape[2:-1]) for rows in (terms, np.moveaxis(rooms, -1, 1)))  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class _Times:
+    """Roughness as a function of the logarithms of the relative durations, without obstacles."""
+
+    scene: _Scene
+    places: Array
+
+    def values(self, x: Array) -> tuple[Array, Array]:
+        """Terms of the roughness."""
+        return self.scene.values(np.append(self.places, x))[0], np.ones(1)
+
+    def slopes(self, x: Array) -> tuple[Array, Array]:
+        """Derivatives of the terms."""
+        return self.scene.slopes(np.append(self.places, x), positions=False)[0], np.zeros((1, x.size))
 
 
 def _decoded(task: _Task, vias: _Vias, x: Array) -> _Vias:
@@ -605,11 +653,13 @@ def _decoded(task: _Task, vias: _Vias, x: Array) -> _Vias:
     return _Vias(vias.segments, times, task.size * x[: 2 * count].reshape(2, count))
 
 
+def _encoded(task: _Task, vias: _Vias) -> Array:
+    """Unknowns of `_moved`."""
+    logarithms = [_logarithms(task, vias, segment) for segment in np.unique(vias.segments)]
+    return np.concatenate([vias.positions.ravel() / task.size, *logarithms])
+
+
 def _logarithms(task: _Task, vias: _Vias, segment: int) -> Array:
     """Logarithms of the relative durations within a segment, relative to the last one."""
     shares = np.log(np.diff([task.times[segment], *vias.times[vias.segments == segment], task.times[segment + 1]]))
     return shares[:-1] - shares[-1]
-
-
-def _key(x: Array) -> bytes:
-    return np.asarray(x, dtype=float).tobytes()

@@ -351,7 +351,9 @@ AVOID = Table(
         "clearance": Entry(Number(minimum=0.0), "required clearance from the obstacles", default=0.0),
         "load": Entry(Number(minimum=0.0), "radius of the load", default=0.0),
         "rope": Entry(Flag(), "whether the rope of a crane must have the clearance as well", default=False),
-        "max_points": Entry(Whole(1), "maximum number of inserted via points", default=4),
+        "max_points": Entry(
+            Whole(1), "maximum number of inserted via points; default: corners of the shortest path plus 1, at least 4"
+        ),
     }
 )
 """Table [avoid]."""
@@ -402,7 +404,7 @@ class _Task:
         """Plan around the obstacles."""
         if not self.obstacles:
             raise self.reader.error(f"{place}.avoid", "must be given with tables [[obstacles]], got none")
-        load, rope, most = self._load, self._rope, self.avoid.get("max_points", 4)
+        load, rope, most = self._load, self._rope, self.avoid.get("max_points")
         required = self.avoid.get("clearance", 0.0)
         try:
             return avoid(plan, self.obstacles, clearance=required, load=load, rope=rope, max_points=most).plan

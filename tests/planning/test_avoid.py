@@ -8,8 +8,10 @@ import re
 import numpy as np
 import pytest
 from natural import NaturalCubic
+from repetitions import one_in
 
 import ctrlplan as cp
+from ctrlplan.planning import plan_length
 from ctrlplan.planning.avoid import avoid
 from ctrlplan.planning.clearance import clearance
 from ctrlplan.planning.obstacles import Disc, HalfPlane, Rectangle
@@ -128,6 +130,47 @@ def test_a_slalom_between_walls_without_end(family):
     obstacles = [Rectangle((5.0, 6.0), (-1.0, INF)), Rectangle((13.0, 14.0), (-INF, 1.0))]
     found = avoid(plan, obstacles, clearance=0.2, load=0.3).plan
     check(plan, found, obstacles, gap=0.2, load=0.3)
+
+
+LATE = Rectangle((8.0, 15.0), (35.0, 60.0)), cp.HalfPlane((0.0, 1.0), 52.0)
+
+
+@pytest.mark.parametrize("family", ["polynomial", "piecewise"])
+@pytest.mark.parametrize("gap", one_in(3, [0.0, 0.01, 0.1, 0.5, 1.0]))
+def test_a_wall_that_must_be_passed_far_below(family, gap):
+    """The shortest polyline is 62.08 m at a clearance of 0; what is found is at most 5 % above 64 m."""
+    still = [[0.0, 0.0]] * 4
+    points = [cp.Waypoint(0.0, [0.0, 50.0], *still), cp.Waypoint(40.0, [50.0, 50.0], *still)]
+    plan = cp.PolySpline(points) if family == "polynomial" else cp.PiecewiseSpline(points)
+    found = avoid(plan, LATE, clearance=gap).plan
+    check(plan, found, LATE, gap=gap)
+    x, z = found(np.linspace(0.0, 40.0, 20_001))
+    assert not ((x > 8.0 + 1e-9) & (x < 15.0 - 1e-9) & (z > 35.0 + 1e-9)).any()
+    around = np.hypot(8.0, 15.0 + gap) + 7.0 + np.hypot(35.0, 15.0 + gap)
+    assert around * 0.99 < plan_length(found) <= 1.05 * (64.0 + 2.0 * gap)
+
+
+WALLS = [
+    Rectangle((4.0 * k + 1.8, 4.0 * k + 2.2), (-INF, 1.0) if k % 2 else (-1.0, INF)) for k in range(9)
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("order", one_in(3, [2, 3, 4], first=1))
+def test_a_slalom_of_nine_walls(order):
+    """The shortest polyline has 18 corners, and at a clearance of 0.2 a length of 42.80 m."""
+    still = [[0.0, 0.0]] * order
+    plan = cp.PiecewiseSpline([cp.Waypoint(0, [0, 0], *still), cp.Waypoint(36, [36, 0], *still)])
+    found = avoid(plan, WALLS, clearance=0.2).plan
+    check(plan, found, WALLS, gap=0.2, points=10)
+    assert 42.79 < plan_length(found) < 1.05 * 42.80
+    height = np.interp(4.0 * np.arange(9) + 2.0, *found(np.linspace(0.0, 36.0, 4001)))
+    assert (height * (-1.0) ** np.arange(9) < -1.19).all()
+
+
+def test_fewer_via_points_than_walls_are_said():
+    plan = cp.PiecewiseSpline(rest([0.0, 0.0], [36.0, 0.0]))
+    with pytest.raises(ValueError, match=r"no plan with 2 via points or fewer and a clearance of 0\.2 was found"):
+        avoid(plan, WALLS, clearance=0.2, max_points=2)
 
 
 def test_windows_in_two_walls():
