@@ -18,7 +18,7 @@ from ctrlplan.simulation.built_forms import BuiltForm, BuiltForms, DisagreementE
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Block, Network, UnsupportedError
-from ctrlplan.simulation.sampled_form import SampledForm, sampled_form
+from ctrlplan.simulation.sampled_form import DelayedForm, SampledForm, delayed_form, sampled_form
 from ctrlplan.simulation.segments import DelayedSignal
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
 from ctrlplan.simulation.starts import command_starts
@@ -75,6 +75,7 @@ class Prepared(Displayed):
         except UnsupportedError as error:
             self.unsupported = str(error)
         self.sampled: SampledForm | None = None
+        self.delayed: DelayedForm | None = None
         self.not_sampled = self.not_linear
         for block in self._blocks():
             if block.delay is not None or block.period is not None:
@@ -85,9 +86,19 @@ class Prepared(Displayed):
                 self.sampled = sampled_form(self.network)
             except NotLinearError as error:
                 self.not_sampled = str(error)
+                self._use_delays(self.network)
         self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
         self._built_forms = BuiltForms()
         self.starts = command_starts(self._blocks())
+
+    def _use_delays(self, network: Network) -> None:
+        """Use the form of a continuous loop with delays, if it is one."""
+        if not network.blocks_with("delay"):
+            return
+        try:
+            self.delayed = delayed_form(network)
+        except NotLinearError as error:
+            self.not_sampled = str(error)
 
     def _describe(self) -> Iterator[Part]:
         yield f"Prepared form of {self.name}: {counted(self.nstates, 'state')}"

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
+from ctrlplan.simulation.exact import state_scale
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, closed, linear_forms, singular_loop
 from ctrlplan.simulation.network import Block, Network
 from ctrlplan.simulation.segments import as_fraction
@@ -270,6 +271,70 @@ def sampled_form(network: Network) -> SampledForm:
     if len(found.timings) > _TIMINGS:
         raise NotLinearError(f"its blocks have more than {_TIMINGS} different periods and offsets")
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class DelayedForm:
+    """Linear continuous loop with delays: x' = a x + b w; w: inputs, sources and delayed signals.
+
+    Attributes
+    ----------
+    name : str
+        Name of the loop.
+    a, b : ndarray, shapes (n, n) and (n, nw)
+        The flow.
+    signals_z, signals_w : ndarray, shapes (nsignals, n) and (nsignals, nw)
+        All signals of the network.
+    read : ndarray, shape (noutputs, nsignals)
+        Outputs of the loop from its signals.
+    lates : tuple of Late
+        Delays; at least one.
+    """
+
+    name: str
+    a: Array
+    b: Array
+    signals_z: Array
+    signals_w: Array
+    read: Array
+    lates: tuple[Late, ...]
+
+    @cached_property
+    def norm(self) -> float:
+        """Bound of the rate of the loop [1/s], with the gains of its delays."""
+        scale = state_scale(self.a)
+        total = np.abs(self.a) * (scale / scale[:, None])
+        for late in self.lates:
+            total = total + np.abs(self.b[:, late.columns]) @ np.abs(late.from_z) * (scale / scale[:, None])
+        return float(total.sum(axis=0).max(initial=0.0))
+
+
+def delayed_form(network: Network) -> DelayedForm:
+    """Form of a linear continuous network with delays.
+
+    Raises
+    ------
+    NotLinearError
+        If a block is nonlinear or sampled; the message names it.
+    ValueError
+        If blocks form an algebraic loop without a solution.
+    """
+    inner = [_inner(block) for block in network.blocks]
+    for block, own in zip(network.blocks, inner, strict=True):
+        if own is not None:
+            raise NotLinearError(f"block {block.name} is sampled, in a loop with a delay between continuous blocks")
+    flow = _flow(network, inner)
+    ny, n = network.nsignals - network.ninputs, network.nstates
+    columns, lates = dict(_time_columns(network)), []
+    for i in network.blocks_with("delay"):
+        block, rows = network.blocks[i], network.inputs[i]
+        width = rows.stop - rows.start
+        initial = np.broadcast_to(np.asarray(block.traits.initial, dtype=float), (width,))
+        from_z, from_w = flow.c[ny:][rows], flow.d[ny:][rows]
+        lates.append(Late(columns[i], float(block.delay or 0.0), initial, from_z, from_w, True, ()))
+    signals_z = np.concatenate([np.zeros((network.ninputs, n)), flow.c[:ny]])
+    signals_w = np.concatenate([np.eye(network.ninputs, flow.b.shape[1]), flow.d[:ny]])
+    return DelayedForm(network.name, flow.a, flow.b, signals_z, signals_w, network.read, tuple(lates))
 
 
 def _inner(block: Block) -> LinearForm | None:

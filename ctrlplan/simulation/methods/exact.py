@@ -9,12 +9,13 @@ import numpy as np
 
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array
+from ctrlplan.simulation.delayed_motion import DelayedMotion
 from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.exact import Jet, exact_states, sampled_states
 from ctrlplan.simulation.job import Job, Record, with_event_times
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.prepared import Prepared
-from ctrlplan.simulation.sampled_form import SampledForm
+from ctrlplan.simulation.sampled_form import DelayedForm, SampledForm
 from ctrlplan.simulation.sampled_motion import moved_signals
 from ctrlplan.simulation.segments import check_periods
 from ctrlplan.simulation.signals import PlanSignal, SampledSignal, signal_values
@@ -35,7 +36,8 @@ class Exact:
 
     def why_not(self, prepared: Prepared) -> str:
         """Block that is not linear; empty if there is none."""
-        return "" if prepared.linear is not None or prepared.sampled is not None else prepared.not_sampled
+        forms = prepared.linear, prepared.sampled, prepared.delayed
+        return prepared.not_sampled if all(form is None for form in forms) else ""
 
     def run(self, job: Job) -> Record:
         """States at the times of a job, to rounding errors.
@@ -50,6 +52,8 @@ class Exact:
             return _run(job, prepared.linear)
         if prepared.sampled is not None:
             return _run_sampled(job, prepared.sampled)
+        if prepared.delayed is not None:
+            return _run_delayed(job, prepared.delayed)
         raise TypeError(f"{prepared.name} must be linear, but {prepared.not_sampled}")
 
 
@@ -84,6 +88,24 @@ def _run_sampled(job: Job, form: SampledForm) -> Record:
         _warn_of_uncertainty(job, form.c @ z + form.d @ w, form.c @ nearly + form.d @ w, floor)
     states = z[:n]
     return Record(times, states, snapshot, interpolate, watched, Exact.name, "linear, with discrete blocks or delays")
+
+
+def _run_delayed(job: Job, form: DelayedForm) -> Record:
+    """Record of a linear continuous loop with delays."""
+    given = job.prepared.time_signals(job.inputs, job.first)
+    motion = DelayedMotion(form, given, job.first, float(job.times[-1]), job.state)
+    watched = job.watched()
+    times = with_event_times(job.times, watched, lambda: form.a)
+
+    def snapshot(t: Array, x: Array) -> Snapshot:
+        w = motion.at(t)[1]
+        signals = form.signals_z @ x + form.signals_w @ w
+        return Snapshot(t, x, w[: job.prepared.ninputs], form.read @ signals, lambda: signals)
+
+    def interpolate(k: int, t: float) -> Array:
+        return motion.at(np.array([t]))[0][:, 0]
+
+    return Record(times, motion.at(times)[0], snapshot, interpolate, watched, Exact.name, "linear, with delays")
 
 
 def _run(job: Job, form: LinearForm) -> Record:
