@@ -109,9 +109,11 @@ def limits_of(loop: System) -> dict[str, tuple[float, float]]:
         Outputs without limits are omitted.
     """
     found: dict[str, tuple[float, float]] = {}
-    for block in getattr(loop, "syslist", None) or ():
+    blocks = getattr(loop, "syslist", None) or ()
+    for block in blocks:
         found |= limits_of(block)
     for name, (_, low, high) in (traits_of(loop).watched or {}).items():
         found[name] = (float(low), float(high))
-    known = loop.output_labels or ()
+    # A plant may declare limits of its inputs, which are outputs of the network around it.
+    known = [*(loop.output_labels or ()), *(() if blocks else loop.input_labels or ())]
     return {name: pair for name, pair in found.items() if name in known}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import control as ct
 import control.flatsys as fs
@@ -14,7 +16,7 @@ from scipy.linalg import solve_continuous_are
 
 from ctrlplan._checks import check_kind, check_signals, checked_vector, real_array
 from ctrlplan._display import Displayed, Facts, Part
-from ctrlplan._types import Array, Params, Value
+from ctrlplan._types import Array, EventName, Params, Value
 from ctrlplan.flatness import DerivedFlatSystem, FlatSystem
 from ctrlplan.systems.derived_laws import InputLimits, create_derived_law, input_bounds
 from ctrlplan.systems.flat import create_flat_iosystem, derived_system_of
@@ -269,7 +271,7 @@ def flat_loop(
         raise TypeError(f"law must be a FlatLaw, Feedforward or TVLQR, got {type(chosen).__name__}")
     axes = flat.matched(plan)
     _check_no_step(axes, flat)
-    plant = _plant(flat, disturbances)
+    plant = _limited(_plant(flat, disturbances), flat, limits)
     controller = chosen.create(flat, axes, limits)
     blocks = [controller, plant]
     unused: list[str] = []
@@ -302,6 +304,24 @@ def _check_no_step(plan: Trajectory, flat: FlatSystem) -> None:
 
 def _wrong_state(given: Value, flat: FlatSystem) -> Array:
     raise ValueError(f"initial_state must have the shape ({flat.nstates},), got {given!r:.40}")
+
+
+def _limited(plant: ct.NonlinearIOSystem, flat: FlatSystem, limits: InputLimits | None) -> ct.NonlinearIOSystem:
+    """The plant with limits of its inputs declared, which reports state."""
+    bounds = input_bounds(limits, flat)
+    if bounds is None:
+        return plant
+    rows = zip(flat.input_labels, *(side.tolist() for side in bounds), strict=True)
+    watched = {
+        EventName(label, "was at its limit"): (partial(_input, k), low, high)
+        for k, (label, low, high) in enumerate(rows)
+        if math.isfinite(low) or math.isfinite(high)
+    }
+    return declare(plant, watched=watched)
+
+
+def _input(k: int, t: Value, x: Value, u: Value, params: Params) -> Value:
+    return u[k]
 
 
 def _clipping(flat: FlatSystem, limits: InputLimits | None) -> Callable[[Array], Array]:

@@ -11,6 +11,7 @@ from study_text import to_toml
 import ctrlplan as cp
 from ctrlplan.cli import main
 from ctrlplan.studies.files import StudyError, load_study
+from ctrlplan.studies.limits import limits_sentence
 from ctrlplan.studies.loops import LOOP_KINDS
 
 pytest.importorskip("casadi")
@@ -157,6 +158,15 @@ def test_options_of_the_law(name, stated):
     np.testing.assert_allclose(found.outputs["angle"], known.outputs["angle"], atol=1e-6)
     if limits:
         assert np.abs(found.outputs["voltage"]).max() <= 60.0
+
+
+def test_limits_of_inputs_are_those_of_actuators(stated):
+    """The report states them, and whether they are reached."""
+    table = motor()["loop"] | {"input_limits": {"voltage": [-60.0, 200.0]}}
+    found = stated(motor(loop=table, plans=[{"family": "polynomial"}, {"family": "step"}])).run().comparison
+    assert found.limits["step"] == {"voltage": (-60.0, 200.0)}
+    assert np.max(found.responses["step"].outputs["voltage"]) == 200.0
+    assert limits_sentence(found) == "Actuator limits: satisfied; reached: voltage (polynomial), voltage (step)."
 
 
 @pytest.mark.slow
