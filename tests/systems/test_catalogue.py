@@ -311,8 +311,11 @@ def test_parameters_of_a_simulation_are_those_of_the_maps_as_well(case):
     other = type(case.plant)(**{**vars(case.plant), label: value})
     flat, jet = case.plant.flat_system(), case.plan.jet(case.plan.start + 0.4 * case.plan.duration, max(case.orders))
     flag = [jet[: r + 1, j] for j, r in enumerate(case.orders)]
-    for found, known in zip(flat.reverse(flag, {label: value}), other.flat_system().reverse(flag), strict=True):
-        np.testing.assert_array_equal(found, known)
+    known = other.flat_system().reverse(flag)
+    for found in (flat.reverse(flag, {label: value}), flat.with_params({label: value}).reverse(flag)):
+        np.testing.assert_array_equal(np.concatenate(found), np.concatenate(known))
+    with pytest.raises(ValueError, match=f"params must be among the parameters of {flat.name} .*, got 'size'"):
+        flat.with_params({"size": 1.0})
     x, u = flat.reverse(flag)
     np.testing.assert_array_equal(flat.updfcn(0.0, x, u, {label: value}), other.iosystem().dynamics(0.0, x, u))
 

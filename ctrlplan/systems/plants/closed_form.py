@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -93,6 +94,27 @@ class ClosedFormFlatSystem(FlatSystem):
     def derived(self) -> DerivedFlatSystem:
         """The same plant with maps derived from its equations, for laws (extra ``fast``)."""
         return self.plant.derived(str(self.name), self.operating_point)
+
+    def with_params(self, params: Mapping[str, float]) -> FlatSystem:
+        """Same plant with other values of parameters.
+
+        Parameters
+        ----------
+        params : mapping of str to float
+            Values by name; the others stay.
+
+        Raises
+        ------
+        ValueError
+            If a name is unknown, or a value is out of its range.
+        """
+        for name in params:
+            if name not in self.params:
+                known = ", ".join(self.params)
+                raise ValueError(f"params must be among the parameters of {self.name} ({known}), got {name!r}")
+        plant: Any = self.plant  # a dataclass
+        other: Plant = replace(plant, **params)
+        return other.flat_system(str(self.name), at=self.operating_point)
 
     def _states_and_inputs(self, plan: Trajectory, times: Array, start: Array | None) -> tuple[Array, Array]:
         """States and inputs along a plan, of which the whole is checked; angles are continuous.
