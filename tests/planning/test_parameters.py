@@ -293,7 +293,7 @@ def by_position(p, /):
         (cp.plants.Crane(), 500.0, TypeError, "params must be a mapping of names to numbers or pairs"),
         (servo, {"mass": (1, 2)}, ValueError, r"params must be among the parameters of servo \(k, zeta\), got 'mass'"),
         (servo(), {"k": (1, 2)}, TypeError, "system must be a plant with parameters by name .* got StateSpace"),
-        (cp.plants.dc_motor(), {"inertia": (1, 2)}, TypeError, "with params, system must be .* got .*FlatSystem"),
+        (cp.plants.integrator_chain(2), {"k": (1, 2)}, TypeError, "with params, system must be .* got FlatSystem"),
         (None, {"k": (1, 2)}, TypeError, "with params, system must be a plant .* got NoneType"),
         (returns_nothing, {"p": (1, 2)}, TypeError, "system must return a loop or a flat system, got NoneType"),
         (by_position, {"p": (1, 2)}, TypeError, "of by_position must be accepted by keyword, got p by"),

@@ -338,8 +338,12 @@ def test_margins_over_a_range_of_a_parameter(case):
     label = next(iter(case.plant.flat_system().params))
     value, signal = getattr(case.plant, label), next(iter(case.plant.signals.inputs))
     bounds = {label: (0.9 * value, 1.1 * value)}
-    found = cp.margins(case.plan, {signal: (-1e6, 1e6)}, case.plant, params=bounds)
-    assert found.satisfied
+    found = [
+        cp.margins(case.plan, {signal: (-1e6, 1e6)}, system, params=bounds)
+        for system in (case.plant, case.plant.flat_system())
+    ]
+    assert all(one.satisfied for one in found)
+    assert str(found[0]) == str(found[1])
 
 
 # One interface
