@@ -262,6 +262,22 @@ def test_headings_are_continuous_round_a_circle(steering, turns):
     np.testing.assert_allclose(flat.states_and_inputs(plan, t, start=[0, 0, 6.0, *x[3:, 0]])[0][2], x[2] + 2.0 * np.pi)
 
 
+def test_a_quadrotor_that_loops():
+    """On circles with an acceleration above g the roll angle grows by a turn each, as atan2 without its jumps."""
+    rate, size, points = 4.0, 2.0, []
+    for angle in np.linspace(0.0, 4.0 * np.pi, 33):
+        turn = angle + np.arange(5) * np.pi / 2
+        x, z = size * rate ** np.arange(5) * np.array([np.sin(turn), -np.cos(turn)])
+        points.append(cp.Waypoint.from_jets(angle / rate, x=x, z=z))
+    plan = cp.PiecewiseSpline(points)
+    t = np.linspace(0.0, plan.end, 2001)
+    theta = cp.plants.PlanarQuadrotor().flat_system().states_and_inputs(plan, t)[0][2]
+    pull = size * rate**2
+    known = np.unwrap(np.arctan2(pull * np.sin(rate * t), pull * np.cos(rate * t) + 9.81))
+    np.testing.assert_allclose(theta, known, atol=5e-3)
+    assert theta[-1] == pytest.approx(4.0 * np.pi, abs=1e-9)
+
+
 def test_a_car_in_reverse():
     """The same path backwards: at heading pi, with a negative speed and the steering angle of forward travel."""
     plan = cp.PolySpline(
@@ -476,6 +492,7 @@ def test_a_car_that_is_at_rest_after_its_plan():
             ValueError,
             r"at\['v'\] must be above or below 0",
         ),
+        (lambda: cp.plants.DCMotor().flat_system(at=1.0), TypeError, "at must be a mapping of states and inputs"),
         (
             lambda: cp.plants.DCMotor().flat_system().states_and_inputs(LANE, 0.0),
             ValueError,

@@ -13,7 +13,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_finite
+from ctrlplan._checks import check_kind, checked_finite
 from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness import DerivedFlatSystem, FlatSystem, flat_system
@@ -146,6 +146,8 @@ class Plant(Displayed, ABC):
         """Operating point in part: the given values in place of the usual ones."""
         signals = self.signals
         known = [*signals.states, *signals.inputs]
+        if at is not None:
+            check_kind(at, "at", Mapping, "a mapping of states and inputs to values")
         for label, value in (at or {}).items():
             if label not in known:
                 raise ValueError(
