@@ -14,6 +14,8 @@ import sympy as sp
 from strict import WARNINGS
 
 import ctrlplan as cp
+from ctrlplan.systems.plants.parameters import values_of
+from ctrlplan.systems.plants.plant import StateSpacePlant
 
 
 def moved(label, order, *, first, last, duration):
@@ -232,6 +234,18 @@ def test_forward_is_the_inverse_of_reverse(case):
     found = flat.forward(x, u)
     got = np.concatenate([row[:-1] for row in found]) if case.extension == 0 else [row[0] for row in found]
     np.testing.assert_allclose(got, known, rtol=1e-9, atol=1e-9 * np.abs(known).max())
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name != "crane"])
+def test_formulas_of_the_flag_are_the_derivatives_along_the_motion(name):
+    """Against the Taylor series of the motion that the equations give."""
+    case = CASES[name]
+    flat, p = case.plant.flat_system(), values_of(case.plant, None)
+    x, u = flat.states_and_inputs(case.plan, case.plan.start + 0.3 * case.plan.duration)
+    u = 1.1 * u
+    known = StateSpacePlant.forward(case.plant, x, u, p)
+    for found, row in zip(flat.forward(x, u), known, strict=True):
+        np.testing.assert_allclose(found, row, rtol=1e-10, atol=1e-10 * np.abs(row).max())
 
 
 @everyday("car, steering rate", "levitation", "drive, damped")

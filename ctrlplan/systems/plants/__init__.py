@@ -1,4 +1,23 @@
-"""Plants and closed loops, one file each; the crane is a package."""
+"""Plants and closed loops, one file each; the crane is a package.
+
+All plants have one interface, that of `Plant`: ``plant.iosystem()`` is the block
+of its equations, ``plant.flat_system()`` its flat system, for `ctrlplan.flat_loop`;
+``plant.units`` are the units of its signals. `ctrlplan.fastest` and
+`ctrlplan.margins` accept the plant itself. In study files they are kinds of
+loops, by the names in the last column.
+
+====================== =================================== ========================
+plant                  flat outputs                        kind
+====================== =================================== ========================
+`Crane`                x, z of the load                    ``"crane"``
+`DCMotor`              angle                               ``"dc-motor"``
+`FlexibleJoint`        q1, angle of the link               ``"flexible-joint"``
+`KinematicCar`         x, y of the rear axle               ``"kinematic-car"``
+`MagneticLevitation`   gap                                 ``"magnetic-levitation"``
+`PlanarQuadrotor`      x, z of the centre of mass          ``"planar-quadrotor"``
+`TwoMassDrive`         load angle; with damping y          ``"two-mass-drive"``
+====================== =================================== ========================
+"""
 
 from ctrlplan.systems.plants.crane import (
     LAWS,

@@ -75,6 +75,11 @@ class DCMotor(StateSpacePlant):
             (u[0] - p.resistance * x[2] - p.motor_constant * x[1]) / p.inductance,
         ]
 
+    def forward(self, x: Value, u: Value, p: SimpleNamespace) -> Sequence[Value]:
+        """Angle with three derivatives."""
+        _, second, current_rate = self.rates(x, u, p)
+        return [[x[0], x[1], second, (p.motor_constant * current_rate - p.friction * second) / p.inertia]]
+
     def reverse(
         self, jet: Value, p: SimpleNamespace, at: Mapping[str, float]
     ) -> tuple[Sequence[Value], Sequence[Value]]:

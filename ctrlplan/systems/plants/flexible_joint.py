@@ -80,6 +80,15 @@ class FlexibleJoint(StateSpacePlant):
         spring = p.stiffness * (x[1] - x[0])
         return [x[2], x[3], (spring - weight * np.sin(x[0])) / p.link_inertia, (u[0] - spring) / p.motor_inertia]
 
+    def forward(self, x: Value, u: Value, p: SimpleNamespace) -> Sequence[Value]:
+        """Angle q1 with four derivatives."""
+        inertia, k, weight = p.link_inertia, p.stiffness, p.mass * p.gravity * p.length
+        rate, motor_rate, second, motor_second = self.rates(x, u, p)
+        s, c = np.sin(x[0]), np.cos(x[0])
+        third = (k * (motor_rate - rate) - weight * c * rate) / inertia
+        fourth = (k * (motor_second - second) - weight * (c * second - s * rate * rate)) / inertia
+        return [[x[0], rate, second, third, fourth]]
+
     def reverse(
         self, jet: Value, p: SimpleNamespace, at: Mapping[str, float]
     ) -> tuple[Sequence[Value], Sequence[Value]]:

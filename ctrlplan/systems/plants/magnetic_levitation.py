@@ -88,6 +88,13 @@ class MagneticLevitation(StateSpacePlant):
             (u[0] - p.resistance * current + 2.0 * pull * speed) / inductance,
         ]
 
+    def forward(self, x: Value, u: Value, p: SimpleNamespace) -> Sequence[Value]:
+        """Gap with three derivatives."""
+        speed, second, current_rate = self.rates(x, u, p)
+        pull = p.force_constant * x[2] / (x[0] * x[0])
+        third = -2.0 * pull / p.mass * (current_rate - x[2] * speed / x[0])
+        return [[x[0], speed, second, third]]
+
     def reverse(
         self, jet: Value, p: SimpleNamespace, at: Mapping[str, float]
     ) -> tuple[Sequence[Value], Sequence[Value]]:

@@ -114,8 +114,8 @@ class Plant(Displayed, ABC):
             Name of the system. Default: that of the plant.
         maps : {"closed_form", "derived"}, optional
             Flat maps by the formulas of the literature, or derived from the
-            equations, which requires the extra ``fast``. Both agree; laws that need
-            more than closed-form maps derive the others themselves.
+            equations, which requires the extra ``fast``. Both agree. Laws
+            with a dynamic extension use derived maps with either.
         at : mapping of str to float, optional
             Values of states and inputs that select a branch of the maps, such as
             ``{"v": -1.0}`` for a car in reverse. Default: the usual operation.
@@ -232,6 +232,19 @@ class StateSpacePlant(Plant):
         known = list(self.signals.states)
         return [x[known.index(name)] for name in self.signals.flat_outputs]
 
+    def forward(self, x: Value, u: Value, p: SimpleNamespace) -> Sequence[Value]:
+        """Flat outputs with their derivatives up to the orders, for constant inputs.
+
+        From the Taylor series of the motion; a plant whose static law is simulated
+        overrides it by formulas, which take less time.
+        """
+        orders = self.signals.orders
+        state = [Taylor.constant(value) for value in x]
+        for _ in range(max(orders)):  # each iteration gives one more derivative
+            rates = [_as_series(rate, state[0]) for rate in self.rates(state, u, p)]
+            state = [Taylor.integral(value, rate) for value, rate in zip(x, rates, strict=True)]
+        return [series.to_jet(_as_series(y, state[0]).terms) for y in self.flat_outputs(state, p)]
+
     def conditions(self, jet: Value, p: SimpleNamespace) -> dict[str, Value]:
         """Smooth functions of the jet that must be above 0 for regular maps, by what they are."""
         return {}
@@ -320,13 +333,8 @@ def _output(plant: StateSpacePlant, t: float, x: Value, u: Value, params: Params
 
 
 def _forward(plant: StateSpacePlant, x: Value, u: Value, params: Params | None = None) -> list[Value]:
-    """Flag of a state and constant inputs: the Taylor series of the motion gives its derivatives."""
-    p, orders = values_of(plant, params), plant.signals.orders
-    state = [Taylor.constant(value) for value in x]
-    for _ in range(max(orders)):  # each iteration gives one more derivative
-        rates = [_as_series(rate, state[0]) for rate in plant.rates(state, u, p)]
-        state = [Taylor.integral(value, rate) for value, rate in zip(x, rates, strict=True)]
-    return [series.to_jet(_as_series(y, state[0]).terms) for y in plant.flat_outputs(state, p)]
+    """Flag of states and constant inputs."""
+    return [np.array(row) for row in plant.forward(x, u, values_of(plant, params))]
 
 
 def _as_series(value: Value, like: Taylor) -> Taylor:

@@ -85,6 +85,15 @@ class TwoMassDrive(StateSpacePlant):
         lag = p.damping / p.stiffness
         return [x[2] + lag * (p.damping / p.load_inertia * (x[0] - x[2]) - x[3])]
 
+    def forward(self, x: Value, u: Value, p: SimpleNamespace) -> Sequence[Value]:
+        """Flat output with four derivatives, of which the last three are those of the twist of the shaft."""
+        motor_speed, motor_rate, load_speed, load_rate = self.rates(x, u, p)
+        twist, elastic = x[0] - x[2], p.stiffness / p.load_inertia
+        (y,) = self.flat_outputs(x, p)
+        first = load_speed - p.damping / p.load_inertia * twist
+        twisting = [twist, motor_speed - load_speed, motor_rate - load_rate]
+        return [[y, first, *(elastic * value for value in twisting)]]
+
     def reverse(
         self, jet: Value, p: SimpleNamespace, at: Mapping[str, float]
     ) -> tuple[Sequence[Value], Sequence[Value]]:
