@@ -12,6 +12,7 @@ from types import UnionType
 from typing import ClassVar, Union, get_args, get_origin
 
 import control as ct
+import control.flatsys as fs
 import numpy as np
 
 from ctrlplan._types import Data
@@ -195,6 +196,11 @@ class LoopOfModule(LoopKind):
         found = self._returned(table, function, path, **values)
         if isinstance(found, FlatSystem):
             return flat_loops(found, table, path)
+        if isinstance(found, fs.FlatSystem):
+            raise StudyError(
+                f"{path}: loop.kind: {table['kind']!r} must return a loop or a ctrlplan.FlatSystem, got a "
+                f"control.flatsys.{type(found).__name__}; derive the flat system with ctrlplan.flat_system"
+            )
         for entry in LAW:
             if entry in table:
                 raise StudyError(

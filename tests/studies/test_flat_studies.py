@@ -203,6 +203,7 @@ def test_draws_vary_the_plant_and_a_sweep_plant_and_law(stated):
 
 PLANT = """
 import control as ct
+import control.flatsys as fs
 import numpy as np
 import ctrlplan as cp
 
@@ -212,6 +213,10 @@ def plant(gain: float = 2.0) -> cp.FlatSystem:
     arm = ct.nlsys(lambda t, x, u, p: [x[1], gain * u[0] - np.sin(x[0])], None, states=names, inputs=["u"],
                    outputs=names, name="arm")
     return cp.flat_system(arm, "angle")
+
+
+def other() -> ct.InputOutputSystem:
+    return fs.LinearFlatSystem(ct.ss([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], 0))
 
 
 def loop() -> ct.InputOutputSystem:
@@ -280,6 +285,10 @@ WRONG = {
     "poles for a loop": (
         motor(loop=FROM_MODULE | {"kind": "python:own_plant:loop"}),
         ["loop.poles", "a ctrlplan.FlatSystem only", "StateSpace"],
+    ),
+    "a flat system of python-control": (
+        motor(loop=FROM_MODULE | {"kind": "python:own_plant:other"}),
+        ["a ctrlplan.FlatSystem", "control.flatsys.LinearFlatSystem", "ctrlplan.flat_system"],
     ),
     "no poles for a flat system": (motor(loop={"kind": "python:own_plant:plant"}), ["loop.poles", "2 of angle"]),
 }
