@@ -139,9 +139,10 @@ REGION = cp.Region(("v", "delta"), [(2, 0), (0.5, 0.9), (-0.5, 0.9), (-2, 0), (-
     ids=["speed, steering angle and steering rate", "region"],
 )
 def test_without_limits_of_accelerations_a_limit_is_active_everywhere(limits, fastest):
+    """Cells are refined until signals are within 0.5 % of a limit, as a mean over time."""
     found = cp.fastest(PLAN, limits, FLAT, hold="path")
     best = duration_at(fastest)
-    assert best * (1.0 - 1e-6) <= found.duration <= 1.003 * best
+    assert best * (1.0 - 1e-6) <= found.duration <= 1.005 * best
     assert found.margins.satisfied
 
 

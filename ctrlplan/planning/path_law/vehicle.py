@@ -7,8 +7,7 @@ a = d^2s/dt^2, limited signals have one of the forms
 
 (speeds, steering rates and angles; rates of speeds, accelerations along and across the
 path). The first ones limit the rate from above, the second ones are linear in the
-squared rate, so that `fastest_law` applies. The segment is first given a cubic time law,
-which is at rest at both ends.
+squared rate, so that `fastest_law` applies.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import numpy as np
 
 from ctrlplan.planning.bounds import Bound, Limits, Signal
 from ctrlplan.planning.path_law.law import fastest_law
-from ctrlplan.trajectories import PathPlan, PolySpline, Retimed, Trajectory, Waypoint
+from ctrlplan.trajectories import PathPlan, Trajectory
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.internal import InternalTrajectory
 
@@ -76,16 +75,13 @@ def fastest_segment_law(part: PathPlan, limited: Limited, orders: Sequence[int])
     orders : sequence of int
         Of the limited signals, from `orders_on_path`.
     """
-    (curve,) = part.segments
-    base = PolySpline([Waypoint(0.0, curve.start, 0.0), Waypoint(1.0, curve.end, 0.0)], labels=["s"])
-    timed = part.with_laws([base])
-    forms = _Forms(timed, limited)
+    forms = _Forms(part, limited)
     second = [k for k, order in enumerate(orders) if order == 2]
-    virtual = _Signals(timed, forms, second)
-    bounds = _over_time(partial(_fastest_rates, timed, forms), 0, 1) if 1 in orders else []
+    virtual = _Signals(forms, second)
+    bounds = _over_time(partial(_fastest_rates, forms), 0, 1) if 1 in orders else []
     for axis, k in enumerate(second, 1):
-        bounds += _over_time(partial(_differences, timed, forms, k), axis, 2)
-    return Retimed(base, fastest_law(virtual, bounds, virtual.start).plan.law)
+        bounds += _over_time(partial(_differences, forms, k), axis, 2)
+    return fastest_law(virtual, bounds, virtual.start, (0.0, 0.0)).plan.law
 
 
 def _intervals(plan: PathPlan) -> Array:
@@ -116,41 +112,44 @@ class _Forms:
         square = 0.5 * twice - once
         return constant, once - square, square, along
 
+    def inside(self, s: Array) -> tuple[Array, Array, Array, Array]:
+        """The same at parameters (n,) inside of the pieces of a path of one segment."""
+        (curve,) = self.plan.segments
+        return self.at(s + self.plan.pieces.offsets[np.searchsorted(curve.breakpoints[1:-1], s)])
+
 
 class _Signals(InternalTrajectory):
-    """Path parameter, and axes whose first and second derivatives are those of limited signals of the second form."""
+    """Path parameter, and axes whose first and second derivatives by it are B and A of signals of the second form."""
 
     what = "a plan of limited signals"
 
-    def __init__(self, timed: PathPlan, forms: _Forms, second: Sequence[int]) -> None:
-        labels = ("s", *(f"signal{k}" for k in second))
-        self._set_fields(labels=labels, breakpoints=timed.breakpoints, _timed=timed, _forms=forms, _second=list(second))
-
-    _timed: PathPlan
     _forms: _Forms
     _second: list[int]
 
+    def __init__(self, forms: _Forms, second: Sequence[int]) -> None:
+        (curve,) = forms.plan.segments
+        labels = ("s", *(f"signal{k}" for k in second))
+        self._set_fields(labels=labels, breakpoints=curve.breakpoints, _forms=forms, _second=list(second))
+
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment up to the second one; as `Trajectory.segment_jet`."""
-        path = self._timed.coordinate.segment_jet(segment, s, 2)[:, 0]
         found = np.zeros((3, self.naxes, s.size))
-        found[:, 0] = path
-        _, _, square, along = (form[self._second] for form in self._forms.at(path[0]))
-        found[1, 1:] = along * path[1]
-        found[2, 1:] = square * path[1] ** 2 + along * path[2]
+        found[0, 0], found[1, 0] = self.breakpoints[segment] + s, 1.0
+        _, _, square, along = self._forms.at(found[0, 0] + self._forms.plan.pieces.offsets[segment])
+        found[1, 1:], found[2, 1:] = along[self._second], square[self._second]
         return found[: order + 1]
 
 
 def _over_time(sides: Callable[[Array], tuple[Array, Array]], axis: int, order: int) -> list[Bound]:
     """Limits of a derivative of an axis, as functions of time."""
     signal = Signal(f"signal{axis}", order, axis)
-    limits = Limits(low=lambda times: sides(times)[0], high=lambda times: sides(times)[1])
+    limits = Limits(low=lambda s: sides(s)[0], high=lambda s: sides(s)[1])
     return list(limits.bounds(signal.name, signal))
 
 
-def _fastest_rates(timed: PathPlan, forms: _Forms, times: Array) -> tuple[Array, Array]:
+def _fastest_rates(forms: _Forms, s: Array) -> tuple[Array, Array]:
     """Limits of ds/dt by the signals of the first form."""
-    constant, slope, square, along = forms.at(timed.coordinate.jet(times, 0)[0, 0])
+    constant, slope, square, along = forms.inside(s)
     low, high = (np.array([[getattr(b, side)] for b in forms.limited.bounds]) for side in ("low", "high"))
     size = np.abs(slope).max(axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -162,8 +161,8 @@ def _fastest_rates(timed: PathPlan, forms: _Forms, times: Array) -> tuple[Array,
     return -fastest, fastest
 
 
-def _differences(timed: PathPlan, forms: _Forms, k: int, times: Array) -> tuple[Array, Array]:
+def _differences(forms: _Forms, k: int, s: Array) -> tuple[Array, Array]:
     """Limits of a signal of the second form without its constant."""
-    constant = forms.at(timed.coordinate.jet(times, 0)[0, 0])[0][k]
+    constant = forms.inside(s)[0][k]
     bound = forms.limited.bounds[k]
     return bound.low - constant, bound.high - constant
