@@ -6,13 +6,14 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_count, checked_labels, checked_timepts, one_number
+from ctrlplan._checks import checked_count, checked_finite, checked_labels, checked_timepts, one_number
 from ctrlplan._types import Data
+from ctrlplan.trajectories.clipped import Clipped
 from ctrlplan.trajectories.combined import Joined, check_join
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.files import trajectory_from_dict
@@ -248,6 +249,39 @@ class PathPlan(Joined):
         parts = [part for part in getattr(found, "parts", ()) if isinstance(part, Retimed)]
         return self if found is self else self._through(parts, self.directions)
 
+    def stop(
+        self,
+        time: float,
+        limits: Mapping[str, object],
+        *,
+        synchronize: Literal["time", "path"] | None = "time",
+    ) -> Trajectory:
+        """Plan until a time, then to rest in minimum time; as `Trajectory.stop`.
+
+        With ``synchronize="path"`` a path plan, which ends on its path, at the end of the
+        present segment at the latest.
+        """
+        moment = checked_finite(time, "time")
+        if synchronize != "path" or not self.start <= moment <= self.end:
+            return super().stop(moment, limits, synchronize=synchronize)
+        count = 1 + int(np.searchsorted(self.stops[1:-1], moment))
+        begun = self._through(self.parts[:count], self.directions[:count])
+        stopped = super(PathPlan, begun).stop(moment, limits, synchronize="path")
+        tail = stopped.parts[-1] if isinstance(stopped, Joined) else stopped
+        if isinstance(stopped, PathPlan) or not isinstance(tail, Retimed):
+            return stopped
+        return begun._braked(moment, tail)
+
+    def _braked(self, time: float, tail: Retimed) -> Self:
+        """Plan whose last segment is followed from a time on by another time law, that of its time."""
+        *parts, last = self.parts
+        curve, law = last.plan, last.law
+        braking = Retimed(Clipped(law, time, min(tail.plan.end, law.end)), tail.law)
+        whole = braking if time <= law.start else Joined.without_shift([Clipped(law, law.start, time), braking])
+        end = min(float(whole.final[0]), curve.end)
+        passed = curve if end == curve.end else Clipped(curve, curve.start, end)
+        return self._through([*parts, Retimed(passed, whole, self.labels)], self.directions)
+
     def with_laws(self, laws: Sequence[Trajectory]) -> Self:
         """Same path with other time laws."""
         return type(self)(self.segments, self.directions, laws, labels=self.labels)
@@ -257,9 +291,10 @@ class PathPlan(Joined):
 
     def _facts(self) -> list[tuple[str, str]]:
         names = {1: "forward", -1: "backward"}
+        known = [fact for fact in super()._facts() if fact[0] != "segments"]  # of the curves, not of the time laws
         return [
-            *super()._facts(),
-            ("directions", ", ".join(names[direction] for direction in self.directions)),
+            *known,
+            ("segments", ", ".join(names[direction] for direction in self.directions)),
             ("stops at", ", ".join(f"{time:.6g} s" for time in self.stops)),
         ]
 

@@ -106,6 +106,16 @@ def test_the_heading_is_followed_through_turns():
         np.testing.assert_allclose(theta / np.pi, np.array([0.0, 1.0, 2.0, 2.0]) + 2.0 * turns, atol=1e-9)
 
 
+@pytest.mark.slow
+def test_a_stop_on_the_path_keeps_states_and_inputs():
+    stopped = PLAN.stop(7.0, {"acceleration": 3.0, "jerk": 15.0}, synchronize="path")
+    t = np.linspace(0.0, stopped.end + 1.0, 41)
+    theta, speed, delta, rate = expected(stopped, t)
+    x, u = RATE.states_and_inputs(stopped, t)
+    np.testing.assert_allclose(x, [*stopped(t), theta, delta], rtol=1e-10, atol=1e-11)
+    np.testing.assert_allclose(u, [speed, rate], rtol=1e-9, atol=1e-9)
+
+
 def test_axes_in_another_order():
     swapped = cp.PathPlan(
         [piece.select(list(piece.labels)[::-1]) for piece in (FORWARD, BACKWARD)],

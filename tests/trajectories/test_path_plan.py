@@ -80,6 +80,32 @@ def test_the_sequence_of_two_paths_is_a_path():
     assert not isinstance(PLAN.then(hold), cp.PathPlan)
 
 
+@pytest.mark.parametrize(
+    "time", [0.0, 7.0, 11.0, *(pytest.param(time, marks=pytest.mark.slow) for time in (1.5, 3.0, 4.9, 5.0, 10.9))]
+)
+def test_a_stop_on_the_path_is_a_path(time):
+    """The plan until then, a point of the path at the end, reached before the next stop, within the limits."""
+    limits = {"acceleration": 3.0, "jerk": 15.0}
+    stopped = PLAN.stop(time, limits, synchronize="path")
+    if time == 0.0:
+        assert stopped.duration == 0.0
+        return
+    assert isinstance(stopped, cp.PathPlan)
+    before = np.linspace(0.0, time, 9)[:-1]
+    np.testing.assert_allclose(stopped(before), PLAN(before), atol=1e-12)
+    assert stopped.end <= min(stop for stop in PLAN.stops if stop >= time) + 2.0
+    s, p = stopped.path_jet(stopped.end, 1)
+    assert abs(s[1]) <= 1e-9
+    k = len(stopped.segments) - 1
+    np.testing.assert_allclose(stopped.final, PLAN.segments[k](s[0]), atol=1e-12)
+    assert np.hypot(*p[1]) > 1.0  # the heading is determined at the end
+    after = np.linspace(time, stopped.end, 101)
+    assert (np.abs(stopped(after, 2)) <= 3.0 * (1.0 + 1e-6)).all()
+    again = cp.trajectory_from_dict(stopped.to_dict())
+    np.testing.assert_array_equal(again(after), stopped(after))
+    assert not isinstance(PLAN.stop(3.0, limits), cp.PathPlan)
+
+
 def test_one_time_law_for_all_segments():
     plan = cp.PathPlan([FORWARD, BACKWARD], (1.0, -1.0), law(4.0), labels=["a", "b"])
     assert plan.stops == (0.0, 4.0, 8.0)
