@@ -362,7 +362,7 @@ def fastest_under(
     if hold == "path":
         if limited.derivatives_only and limited.order <= 2 and not isinstance(plan, PathPlan):
             return _fastest_on_path(plan, limited, span, ends)
-        if ends != "free":
+        if ends != "free" and not isinstance(plan, PathPlan):  # which is at rest at its ends
             raise ValueError(
                 f'ends must be "free" with limits of quantities or of derivatives of order 3 and higher, got {ends!r}'
             )

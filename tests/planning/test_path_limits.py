@@ -166,6 +166,8 @@ def test_the_fastest_parking_manoeuvre():
 def test_durations_that_are_given():
     limits = {"velocity": 2.0, "acceleration": 1.0}
     longer = cp.fastest(STRAIGHT, limits, hold="path", durations=(20.0, 30.0))
+    given = cp.fastest(STRAIGHT, limits, hold="path", ends="given")  # at rest
+    assert given.duration == cp.fastest(STRAIGHT, limits, hold="path").duration
     assert longer.duration == pytest.approx(20.0)
     assert longer.feasible == ((longer.duration, 30.0),)
     with pytest.raises(ValueError, match=r"for some duration from 5 to 12 s, got a minimum of 13\.00"):

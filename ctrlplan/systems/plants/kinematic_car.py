@@ -29,7 +29,8 @@ class KinematicCar(StateSpacePlant):
     [rad]. Inputs: speed v [m/s], negative in reverse, and steering angle delta [rad];
     with ``steering="rate"`` delta is a state and its rate delta_d1 [rad/s] the input.
     Flat outputs: x and y. The maps are singular at rest, where the
-    heading does not follow from the position.
+    heading does not follow from the position: a car that stops requires a
+    `ctrlplan.PathPlan`.
 
     Parameters
     ----------
