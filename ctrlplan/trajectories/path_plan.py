@@ -365,6 +365,7 @@ def _checked_directions(directions: Iterable[float], count: int) -> tuple[int, .
     return tuple(map(int, numbers))
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _timed(
     curves: tuple[Trajectory, ...], law: Iterable[Trajectory] | Trajectory, labels: Sequence[str]
 ) -> list[Retimed]:
