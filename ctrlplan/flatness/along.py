@@ -352,11 +352,21 @@ def _followed_from_grid(maps: FlatMaps, grid: Grid, p: Array, t: float, flag: Ar
     try:
         return _straight(maps, z, flag, p)
     except SingularError as error:
-        still = not flag[[k for k in range(flag.size) if k not in np.cumsum([0, *maps.orders])]].any()
         raise ValueError(
             f"states of {name} must be determined along the plan, but {error} at {t:.6g} s"
-            f"{f', where the plan is at rest; {ADVICE}' if still else ''}"
+            f"{note_of_still(maps.orders, flag)}"
         ) from None
+
+
+def note_of_still(orders: tuple[int, ...], flag: Array) -> str:
+    """End of a message about a flag (nz,) that does not determine the states: what to do if it is one at rest."""
+    return f"; the plan is at rest there, and {ADVICE}" if at_rest(orders, flag) else ""
+
+
+def at_rest(orders: tuple[int, ...], flags: Array) -> NDArray[np.bool_]:
+    """Whether all derivatives of flags (nz, ...) are 0."""
+    derivatives = np.concatenate([np.arange(r) > 0 for r in orders])
+    return ~flags[derivatives].any(axis=0)
 
 
 def check_branch(maps: FlatMaps, x: Array, u: Array, p: Array, t: Array, name: str) -> None:

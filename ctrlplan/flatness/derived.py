@@ -16,10 +16,12 @@ from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness.along import (
     Grid,
+    at_rest,
     check_branch,
     connected,
     connected_with_neighbour,
     grid_of,
+    note_of_still,
     on_branch,
     rows_of,
     states_along,
@@ -295,17 +297,29 @@ class DerivedFlatSystem(FlatSystem):
         near, left = maps.start, np.arange(flags.shape[1])
         while left.size:
             trial, found = maps.refined(np.repeat(near[:, None], left.size, axis=1), flags[:, left], p)
+            # At rest a state may be one of many with the same flag.
+            for j in np.flatnonzero(found & at_rest(maps.orders, flags[:, left])):
+                found[j] = self._is_regular(trial[:, j], p)
             z[:, left[found]] = trial[:, found]
             left = left[~found]
             if left.size:
                 k = int(left[0])
-                if k:
-                    near = connected_with_neighbour(maps, flags[:, k], p, near, str(self.name), flags.shape[1])
-                else:
-                    near = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
+                try:
+                    if k:
+                        near = connected_with_neighbour(maps, flags[:, k], p, near, str(self.name), flags.shape[1])
+                    else:
+                        near = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
+                except ValueError as error:
+                    raise ValueError(f"{error}{note_of_still(maps.orders, flags[:, k])}") from None
                 z[:, k] = near
                 left = left[1:]
         return z
+
+    def _is_regular(self, z: Array, p: Array) -> bool:
+        """Whether the flags determine an extended state."""
+        maps = self.maps
+        peaks = np.abs(maps.slopes(maps.start, p) * maps.scales).max(axis=1)
+        return regularity(maps.slopes(z, p) * maps.scales, peaks) >= SINGULAR
 
     def _extended(self, state: Array, plan: Trajectory, p: Array) -> Array:
         """Extended state at the start of a plan for a given state of the plant."""
@@ -320,8 +334,7 @@ class DerivedFlatSystem(FlatSystem):
             z[maps.nstates :] += step
             if not step.size or np.max(np.abs(step) / (maps.scales[maps.nstates :])) < 1e-12:
                 break
-        peaks = np.abs(maps.slopes(maps.start, p) * maps.scales).max(axis=1)
-        if regularity(maps.slopes(z, p) * maps.scales, peaks) < SINGULAR:
+        if not self._is_regular(z, p):
             raise ValueError(
                 f"start must be a state of {self.name} that the flat outputs determine, got one where "
                 f"{maps.weakest(z, p)} is not determined; give the state at the plan's start"

@@ -39,4 +39,4 @@ def is_at_rest(plan: Trajectory, time: float, tolerance: float = _NEAR) -> bool:
 def note_of_rest(plan: Trajectory, time: float) -> str:
     """End of a message about a plan that is not determined at a time: what to do if it is at rest there."""
     known = isinstance(plan, PathPlan) or not is_at_rest(plan, time)
-    return "" if known else f", where the plan is at rest; {ADVICE}"
+    return "" if known else f"; the plan is at rest there, and {ADVICE}"

@@ -166,7 +166,7 @@ def test_maps_by_hand_that_are_not_finite_at_rest_say_what_to_do(plan):
     with pytest.raises(
         ValueError,
         match=rf"delta of by_hand must be determined by the plan, got nan at {plan.start:g} s: the maps are singular "
-        r"there, where the plan is at rest; a plan of a vehicle that stops must be a ctrlplan\.PathPlan",
+        r"there; the plan is at rest there, and a plan of a vehicle that stops must be a ctrlplan\.PathPlan",
     ):
         by_hand("quotient").states_and_inputs(plan, np.linspace(plan.start, plan.end, 5))
 
@@ -190,8 +190,14 @@ def test_maps_by_hand_that_are_finite_but_wrong_at_rest_are_rejected():
 
 def test_derived_maps_at_rest_say_what_to_do():
     for plan in (LINE, LINE.then(LINE + cp.Step([4.0, 3.0], [4.0, 3.0]))):
-        with pytest.raises(ValueError, match=r"states of car.* w1 is not .*at rest; a plan of a vehicle .*PathPlan"):
+        with pytest.raises(ValueError, match=r"states of car.* w1 is not .*at rest there, and a plan of a .*PathPlan"):
             CAR.states_and_inputs(plan, [1.0, 2.0])
+    source = cp.create_source_iosystem(LINE, 2, suffix="_ref")
+    block = cp.create_flat_feedforward_iosystem(CAR)
+    wanted = ct.interconnect([source, block], inputs=0, outputs=block.output_labels)
+    for call in (lambda: cp.margins(LINE, {"v": 20.0}, CAR), lambda: cp.simulate(wanted, [0.0, 4.0])):
+        with pytest.raises(ValueError, match=r"w1 is not determined.*at rest there, and a plan of a .*PathPlan"):
+            call()
     crane = cp.flat_system(cp.plants.Crane().iosystem(), ["x", "z"], at={"R": 10.0})
     ends = [(0.0, [0.0] * 5, [10.0] + [0.0] * 4), (2.0, [0.0] * 5, [40.0] + [0.0] * 4)]
     falling = cp.PolySpline([cp.Waypoint.from_jets(t, x=x, z=z) for t, x, z in ends])
