@@ -57,7 +57,8 @@ class PathPlan(Joined):
         Time law s(t) of each segment, one axis, increasing from the first to the
         last parameter of the segment, at rest at both ends. Each is shifted in time
         to begin where the previous one ends. A single trajectory is the time law
-        of every segment.
+        of every segment or, if the parameter of each segment begins where that of
+        the previous one ends, the time law of all of them one after the other.
     labels : sequence of str, optional
         Names of the axes, by default x and y.
 
@@ -365,6 +366,25 @@ def _checked_directions(directions: Iterable[float], count: int) -> tuple[int, .
     return tuple(map(int, numbers))
 
 
+def _shared(law: Trajectory, curves: tuple[Trajectory, ...]) -> list[Trajectory]:
+    """Time law of each curve from one for all: the same one, or its parts between the breakpoints at its stops."""
+    ends = [curve.end for curve in curves]
+    consecutive = all(curve.start == end for curve, end in zip(curves[1:], ends[:-1], strict=True))
+    slack = 1e-12 * max(map(abs, [curves[0].start, *ends]))
+    if len(curves) == 1 or not consecutive or law.naxes > 1 or abs(float(law.final[0]) - ends[-1]) > slack:
+        return [law] * len(curves)
+    times = [law.start]
+    for end in ends[:-1]:
+        distance = np.abs(law(law.breakpoints) - end)
+        if distance.min() > slack:
+            raise ValueError(
+                f"law must be at rest at a breakpoint at the end of each segment, got no breakpoint at s = {end:.6g}; join "
+                "a time law for each segment by then(), or give a sequence of them"
+            )
+        times.append(float(law.breakpoints[distance.argmin()]))
+    return [Clipped(law, begin, end) for begin, end in pairwise([*times, law.end])]
+
+
 @np.errstate(over="ignore", invalid="ignore")
 def _timed(
     curves: tuple[Trajectory, ...], law: Iterable[Trajectory] | Trajectory, labels: Sequence[str]
@@ -373,7 +393,7 @@ def _timed(
     names = checked_labels(labels, 2)
     if not isinstance(law, Iterable | Trajectory):
         raise TypeError(f"law must be a Trajectory or one for each segment, got {type(law).__name__}")
-    laws = [law] * len(curves) if isinstance(law, Trajectory) else list(law)
+    laws = _shared(law, curves) if isinstance(law, Trajectory) else list(law)
     if len(laws) != len(curves):
         raise ValueError(f"law must be one trajectory for each of {len(curves)} segments, got {len(laws)}")
     parts = []

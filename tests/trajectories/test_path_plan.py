@@ -114,6 +114,19 @@ def test_one_time_law_for_all_segments():
     assert "0 s, 4 s, 8 s" in str(plan)
 
 
+def test_one_time_law_through_all_segments():
+    later = curve((1.0, [6, -5, 0, 0], [2, -5, 0, 0]), (2.0, [2, 0, 0, 0], [-4, -9, 0, 0]))
+    whole = law(5.0).then(law(6.0, 2.0, 1.0))
+    plan = cp.PathPlan([FORWARD, later], [1, -1], whole)
+    assert plan.stops == (0.0, 5.0, 11.0)
+    np.testing.assert_allclose(plan(T), PLAN(T), atol=1e-12)
+    with pytest.raises(ValueError, match=r"law must be at rest at a breakpoint at the end .* at s = 1; join"):
+        cp.PathPlan([FORWARD, later], [1, -1], law(11.0, 2.0))
+    moving = cp.PiecewiseSpline([cp.Waypoint(0, 0, 0), cp.Waypoint(5, 1, 0.3), cp.Waypoint(11, 2, 0)])
+    with pytest.raises(ValueError, match=r"law\[0\] must be at rest at its ends, got the rate"):
+        cp.PathPlan([FORWARD, later], [1, -1], moving)
+
+
 def test_headings_that_differ_at_a_cusp_are_named():
     with pytest.raises(
         ValueError,
