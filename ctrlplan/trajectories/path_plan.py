@@ -378,8 +378,8 @@ def _shared(law: Trajectory, curves: tuple[Trajectory, ...]) -> list[Trajectory]
         distance = np.abs(law(law.breakpoints) - end)
         if distance.min() > slack:
             raise ValueError(
-                f"law must be at rest at a breakpoint at the end of each segment, got no breakpoint at s = {end:.6g}; join "
-                "a time law for each segment by then(), or give a sequence of them"
+                f"law must be at rest at a breakpoint at the end of each segment, got no breakpoint at s = {end:.6g}; "
+                "join a time law for each segment by then(), or give a sequence of them"
             )
         times.append(float(law.breakpoints[distance.argmin()]))
     return [Clipped(law, begin, end) for begin, end in pairwise([*times, law.end])]
