@@ -113,6 +113,7 @@ class PathMaps:
     ) -> None:
         self._pieces, self._order = plan.pieces, max(orders)
         self._degrees = np.array(degrees)[:, None]
+        self._nstates = len(states)
         self._maps: list[tuple[CurveMap, int]] = []
         end = start
         for k, (curve, direction) in enumerate(zip(plan.segments, plan.directions, strict=True)):
@@ -136,6 +137,8 @@ class PathMaps:
         s, rate : ndarray, shape (n,)
             Parameters of the curves, and ds/dt.
         """
+        if not s.size:
+            return np.empty((self._nstates, 0)), np.empty((self._degrees.size, 0))
         jet = self._pieces.jet(numbers, s, self._order)
         curves = self._pieces.curve[numbers]
         found: list[tuple[NDArray[np.intp], Array, Array]] = []

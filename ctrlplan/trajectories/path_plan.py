@@ -185,7 +185,7 @@ class PathPlan(Joined):
         jet = self.coordinate.jet(times.ravel(), highest, left)[:, 0]
         numbers, jet[0] = self.pieces.located(jet[0])
         p = self.pieces.jet(numbers, jet[0], highest)
-        return jet.reshape(-1, *times.shape), p.reshape(-1, self.naxes, *times.shape)
+        return jet.reshape(highest + 1, *times.shape), p.reshape(highest + 1, self.naxes, *times.shape)
 
     def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""

@@ -30,6 +30,11 @@ def test_cars_have_finite_states_and_inputs_at_the_stops(flat):
     one, inputs = flat.states_and_inputs(PLAN, 5.0)
     np.testing.assert_allclose(one, x[:, -2], rtol=1e-13, atol=1e-13)
     assert inputs.shape == (2,)
+    x, u = flat.states_and_inputs(PLAN, [])
+    assert (x.shape, u.shape) == ((flat.nstates, 0), (2, 0))
+    assert flat.states_and_inputs(PLAN, [[0.0, 1.0]])[0].shape == (flat.nstates, 1, 2)
+    with pytest.raises(ValueError, match="timepts must be finite"):
+        flat.states_and_inputs(PLAN, np.inf)
 
 
 def test_the_car_of_python_control_with_its_limited_steering_angle():

@@ -32,6 +32,7 @@ def test_parameter_and_curve_over_time():
         np.testing.assert_allclose(p[:, :, j], PLAN.segments[k].jet(inside, 3), rtol=1e-12, atol=1e-11)
     assert PLAN.path_jet(2.0, 0)[1].shape == (1, 2)
     assert PLAN.path_jet(np.zeros((2, 3)), 1)[0].shape == (2, 2, 3)
+    assert PLAN.path_jet([], 1)[1].shape == (2, 2, 0)
 
 
 def test_both_sides_of_a_stop_and_of_a_breakpoint_of_a_curve():
