@@ -85,20 +85,27 @@ class Scales:
         Absolute tolerance in units of the scales.
     relative : ndarray, shape (nstates,)
         Factors of the relative tolerance.
+    unresolved : ndarray of bool, shape (nstates,)
+        States whose displacement in the run before was below its absolute tolerance.
     """
 
     shift: Array
     scale: Array
     atol: float
     relative: Array
+    unresolved: NDArray[np.bool_]
 
     @classmethod
     def plain(cls, nstates: int, atol: float | None) -> Scales:
         """Unscaled states, with a tolerance in their units."""
-        return cls(np.zeros(nstates), np.ones(nstates), RELATIVE if atol is None else atol, np.ones(nstates))
+        ones = np.ones(nstates)
+        return cls(np.zeros(nstates), ones, RELATIVE if atol is None else atol, ones, np.zeros(nstates, dtype=bool))
 
     def renewed(self, states: Array, noise: Callable[[], Array]) -> Scales | None:
         """Scales for the states of a run; None if the present ones are adequate.
+
+        A state below the tolerances of two runs, although that of the second was set
+        for it, is zero but for the errors of the solver: its scale remains.
 
         Parameters
         ----------
@@ -110,8 +117,10 @@ class Scales:
         """
         moved = np.abs(states - states[:, :1]).max(axis=1, initial=0.0)
         size = np.abs(states).max(axis=1, initial=0.0)
-        small = (moved > 0.0) & (moved < _SMALL * self.scale)
-        about = (moved > 0.0) & (moved < _OFFSET * size) & (self.shift == 0.0)
+        unresolved = moved < self.atol * self.scale
+        real = (moved > 0.0) & ~(unresolved & self.unresolved)
+        small = real & (moved < _SMALL * self.scale)
+        about = real & (moved < _OFFSET * size) & (self.shift == 0.0)
         if not (small | about).any():
             return None
         floor = _NOISE * noise()
@@ -120,7 +129,8 @@ class Scales:
         shift = np.where(about, states[:, 0], self.shift)
         if np.all(scale >= _SMALL * self.scale) and np.array_equal(shift, self.shift):
             return None
-        return replace(self, shift=shift, scale=np.minimum(scale, np.where(small, self.scale, np.inf)))
+        scale = np.minimum(scale, np.where(small, self.scale, np.inf))
+        return replace(self, shift=shift, scale=scale, unresolved=unresolved)
 
     def perturbed(self, states: Array, rtol: Array | float, atol: float) -> Array:
         """States (nstates, ntime) moved by the tolerance of a step, up and down in turn."""
@@ -151,7 +161,8 @@ class Scales:
             smaller one.
         """
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
-        close = np.where(loose & (size > 0.0), np.maximum(_OWN * size, _NOISE * noise), np.inf)
+        loose = loose & (size > self.atol * self.scale)
+        close = np.where(loose, np.maximum(_OWN * size, _NOISE * noise), np.inf)
         scale = np.minimum(self.scale, close)
         others = max(_CLOSER, min(1.0, _STEPS / (evaluations or 1)))
         return replace(self, scale=scale, relative=np.where(loose | (evaluations is None), _CLOSER, others))
