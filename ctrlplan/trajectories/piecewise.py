@@ -51,6 +51,10 @@ class PiecewiseSpline(WaypointSpline):
     accelerations are. Free entries at the ends lower the degree of the first and
     last segment. Derivatives that no waypoint prescribes may jump.
 
+    A dwell is a pair of waypoints at the same position with zero derivatives up to the
+    highest order that is prescribed for the axis: between them the plan is
+    constant. With a derivative left free, it overshoots there.
+
     Parameters
     ----------
     waypoints : iterable of Waypoint
@@ -80,6 +84,16 @@ class PiecewiseSpline(WaypointSpline):
     -----
     UserWarning
         If the plan swings far beyond its waypoints (`warn`).
+
+    Examples
+    --------
+    Rise, dwell and return of a cam:
+
+    >>> import ctrlplan as cp
+    >>> rest = (0, 0)
+    >>> cam = cp.PiecewiseSpline([cp.Waypoint(t, y, *rest) for t, y in [(0, 0), (1, 5), (3, 5), (4, 0)]])
+    >>> cam([1.5, 2.0, 2.5]), cam.jumps(2)
+    (array([5., 5., 5.]), ())
     """
 
     family = "piecewise"
