@@ -17,7 +17,7 @@ Plan a move
     fit                       plan through samples, within a tolerance or smoothed
     as_trajectory             plans from splines of scipy and from results of python-control
     load_trajectory, trajectory_from_dict    stored plans
-    Trajectory                what all plans have: values, derivatives, extrema, stop, plot, export, algebra
+    Trajectory                what all plans have: values, extrema, stop, repeat, plot, export, algebra
     WaypointSpline            base class of a spline of your own
 Choose what is left free
     choose_alpha              shape by an objective: PeakDerivative, SquaredDerivative -> AlphaChoice

@@ -88,7 +88,7 @@ def _step(terms: Array, rooms: Array, by_terms: Array, by_rooms: Array, reach: f
     identity = np.eye(count)
     rows = np.vstack([by_rooms, identity, -identity])
     sides = np.concatenate([-rooms - missed, np.full(2 * count, -reach)])
-    # Least distance programming (Lawson and Hanson, Solving Least Squares Problems, 23): y = r (d - solved),
+    # A problem LDP of Lawson and Hanson (Solving Least Squares Problems, chapter 23) with y = r (d - solved):
     # min |y|^2 subject to rows d >= sides.
     g, h = np.linalg.solve(r.T, rows.T), sides - rows @ solved
     u = nnls(np.vstack([g, h]), np.append(np.zeros(count), 1.0), maxiter=50 * len(h))[0]

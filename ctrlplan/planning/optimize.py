@@ -37,6 +37,7 @@ from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.conjugate import FreeEntries
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.piecewise import alike
+from ctrlplan.trajectories.quadrature import gauss
 from ctrlplan.trajectories.waypoint import Entries, entry_name, waypoint_table
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
@@ -204,7 +205,10 @@ def optimize_waypoints(
         better = problem.solve((chosen - start) / duration)
         if better.cost @ factors < found.cost @ factors:
             found, times = better, chosen
-    _check_digits(problem, found, times)
+    error = _relative_error(problem, found)
+    if error > _FEW and problem.is_minimal() and problem.has_digits(np.diff(times) / duration):
+        return _resolved(Entries(times, readonly(table), np.full(len(points), order + 1), names), derivative, factors)
+    _check_digits(problem, error, times)
 
     sides = np.where(np.isnan(table), found.sides / unit, table)  # prescribed entries are exact
     split, count = problem.split(), np.full(len(points), order + 1)
@@ -224,19 +228,39 @@ def optimize_waypoints(
     return Optimum(chosen_points, plan, cost, found.unique, derivative)
 
 
-def _check_digits(problem: _Problem, found: _Solution, times: Array) -> None:
-    """Warn or raise if rounding of the data causes a large error of the cost."""
+def _resolved(entries: Entries, derivative: int, factors: Array) -> Optimum:
+    """Optimum with short segments: the spline with continuous conjugates, which has all digits of its entries."""
+    plan = PiecewiseSpline.of_entries(entries)
+    nodes, weights = gauss(derivative + 1)
+    costs = [
+        duration * (plan.segment_jet(k, duration * nodes, derivative)[derivative] ** 2 @ weights)
+        for k, duration in enumerate(np.diff(plan.breakpoints).tolist())
+    ]
+    size = entries.table.shape[1]
+    jets = plan.jet(entries.times, size - 1).transpose(2, 0, 1)
+    filled = np.where(np.isnan(entries.table), jets, entries.table)
+    rows = zip(entries.times.tolist(), filled, strict=True)
+    points = tuple(Waypoint.from_array(t, jet.copy(), entries.labels) for t, jet in rows)
+    return Optimum(points, plan, float(np.sum(costs, axis=0) @ factors), True, derivative)
+
+
+def _relative_error(problem: _Problem, found: _Solution) -> float:
+    """Estimated relative error of the cost by rounding of the data."""
     position, higher = problem.table[:, 0], np.nan_to_num(problem.table[:, 1:])
     size = np.nanmax(np.abs(position), axis=0, initial=0.0)
     ranges = np.nanmax(position, axis=0, initial=-np.inf) - np.nanmin(position, axis=0, initial=np.inf)
     ranges[ranges <= 4.0 * _EPS * size] = 0.0  # equal up to rounding
     data = ranges**2 + (higher**2).sum(axis=(0, 1))
     # A cost of 0 is attained up to rounding, relative to that of other plans through similar data.
-    error = float(
-        np.divide(found.rounding, np.maximum(found.cost, 1e-6 * data), where=data > 0.0, out=0.0 * data).max()
-    )
+    floor = np.maximum(found.cost, 1e-6 * data)
+    return float(np.divide(found.rounding, floor, where=data > 0.0, out=0.0 * data).max())
+
+
+def _check_digits(problem: _Problem, error: float, times: Array) -> None:
+    """Warn or raise if rounding of the data causes a large error of the cost."""
     if not error > _FEW:
         return
+    size = np.nanmax(np.abs(problem.table[:, 0]), axis=0, initial=0.0)
     steps = np.diff(times)
     k = int(steps.argmin())
     why = (
@@ -270,6 +294,19 @@ class _Problem:
         self.loose[1:-1, continuity + 1 :] = not single
         known = ~np.isnan(table)
         self.groups = [(known[:, :, axes[0]], np.array(axes)) for axes in alike(known)]
+
+    def is_minimal(self) -> bool:
+        """Whether the optimum is a spline of continuous conjugates with complete entries at both ends."""
+        alpha, order, derivative = self.shape
+        complete = order == derivative - 1 and not np.isnan(self.table[[0, -1]]).any()
+        return complete and not alpha and self.family is _Segments and not self.split().any()
+
+    def has_digits(self, durations: Array) -> bool:
+        """Whether rounding of the positions changes no slope over a segment much, relative to that over the plan."""
+        position = self.table[:, 0]
+        ranges = np.nanmax(position, axis=0, initial=-np.inf) - np.nanmin(position, axis=0, initial=np.inf)
+        rounding = _EPS * np.nanmax(np.abs(position), axis=0, initial=0.0)
+        return bool((rounding <= _FEW * float(durations.min()) * ranges).all())
 
     def split(self) -> NDArray[np.bool_]:
         """Entries that are free on each side separately, shape (nwaypoints, order + 1, naxes)."""

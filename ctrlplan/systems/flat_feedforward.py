@@ -13,6 +13,7 @@ from ctrlplan._checks import check_kind, checked_count, checked_finite, checked_
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness import DerivedFlatSystem, FlatSystem
 from ctrlplan.systems.derived_laws import references
+from ctrlplan.systems.source import switches_of
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 
@@ -114,7 +115,7 @@ def _along(flat: FlatSystem, plan: Trajectory, outputs: list[str], name: str) ->
     def output(t: float, x: Value, u: Value, params: Params) -> Value:
         return np.concatenate(flat.states_and_inputs(axes, t))[-len(outputs) :]
 
-    return declare(ct.nlsys(None, output, inputs=0, outputs=outputs, name=name), breakpoints=plan.breakpoints)
+    return declare(ct.nlsys(None, output, inputs=0, outputs=outputs, name=name), **switches_of(plan))
 
 
 def reference_window(

@@ -20,7 +20,7 @@ from ctrlplan._types import Array, EventName, Params, Value
 from ctrlplan.flatness import DerivedFlatSystem, FlatSystem
 from ctrlplan.systems.derived_laws import InputLimits, create_derived_law, input_bounds
 from ctrlplan.systems.flat import create_flat_iosystem, derived_system_of
-from ctrlplan.systems.source import create_source_iosystem
+from ctrlplan.systems.source import create_source_iosystem, switches_of
 from ctrlplan.traits import declare, traits_of
 from ctrlplan.trajectories import PathPlan, Trajectory
 from ctrlplan.trajectories.trajectory import check_end
@@ -88,7 +88,7 @@ class Feedforward:
 
         clipped = _clipping(flat, limits)
         block = ct.nlsys(None, output, inputs=0, outputs=list(flat.input_labels), name="law")
-        return declare(block, breakpoints=plan.breakpoints)
+        return declare(block, **switches_of(plan))
 
 
 @dataclass(frozen=True, repr=False, eq=False)

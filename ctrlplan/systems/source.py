@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import control as ct
@@ -108,6 +109,17 @@ def axis_signals(plan: Trajectory, labels: Sequence[str] | str | None, suffix: s
     """Signal name of each axis: its label, or the one given instead, with the suffix."""
     own = plan.labels if labels is None else checked_labels(labels, plan.naxes)
     return tuple(label + suffix for label in own)
+
+
+def switches_of(plan: Trajectory) -> dict[str, object]:
+    """Traits of a block that is a function of a plan: its breakpoints.
+
+    Those of a plan that repeats for all future times are declared for the first pass,
+    and steps are short enough to find all others.
+    """
+    if math.isfinite(plan.end):
+        return {"breakpoints": plan.breakpoints}
+    return {"breakpoints": plan.breakpoints, "longest": 0.5 * float(np.diff(plan.breakpoints).min())}
 
 
 def source_samples(plan: Trajectory, timepts: ArrayLike, derivatives: int = 0) -> Array:

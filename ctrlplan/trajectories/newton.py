@@ -349,7 +349,38 @@ class NewtonSystem(Fields):
     @cached_property
     def functions(self) -> Array:
         """Values (size, ntime) of the basis functions on a grid that resolves any plan."""
-        return self.taylor(np.linspace(0.0, 1.0, 2 * self.size + 1), 0)[:, 0]
+        u, alpha = _grid(2 * self.size + 1), effective(self.alpha)
+        first, second = u - self._first[:, None], u - self._second[:, None]
+        single = first
+        if alpha:
+            first, second = np.sin(0.5 * alpha * first), 0.5 * alpha * second
+            single, pair = (2.0 / alpha) * first * np.cos(second), (2.0 / alpha) ** 2 * first * np.sin(second)
+        else:
+            pair = first * second
+        out = np.empty((2 * len(pair) + 1, u.size))
+        out[0] = 1.0
+        np.multiply.accumulate(pair, axis=0, out=out[2::2])
+        np.multiply(out[:-1:2], single, out=out[1::2])
+        if self._fold:
+            out[self.size - 1] += self._fold * out[self.size]
+        return out[: self.size]
+
+    @cached_property
+    def ranges(self) -> tuple[float, ...]:
+        """Bounds of the ranges of the basis functions from the second on, over the unit interval."""
+        first, second = self._first.tolist(), self._second.tolist()
+        return _ranges(effective(self.alpha), tuple(first), tuple(second))[: self.size - 1]
+
+    def stays_near(self, coefficients: Array, factor: float) -> bool:
+        """Whether coefficients exclude a range above a multiple of the distance of the first two positions."""
+        if self._fold or self._orders[:2] != (0, 0):
+            return False
+        first, *others = self.ranges
+        allowed = factor * abs(self._triangle.item(1, 1)) - first
+        for _, slope, *column in coefficients.T.tolist():
+            if not sum([abs(c) * r for c, r in zip(column, others, strict=True)]) <= allowed * abs(slope):
+                return False
+        return True
 
     @cached_property
     def amplification(self) -> float:
@@ -385,6 +416,63 @@ def _taylor_scale(duration: float, orders: tuple[int, ...]) -> Array:
             f"{max(orders)}; choose another unit of time"
         )
     return readonly(scale)
+
+
+@lru_cache(maxsize=256)
+def _ranges(alpha: float, first: tuple[float, ...], second: tuple[float, ...]) -> tuple[float, ...]:
+    """Bounds of the ranges of the basis functions from the second on, from the nodes of each pair.
+
+    Between the nodes a and b of a pair the product of both factors is largest at their
+    mean, outside at the end that is farther from it. Functions with nodes at the ends
+    only do not change their sign.
+    """
+    found: list[float] = []
+    product, signed, alternate = 1.0, True, True  # signs do not change; each pair before has a node at each end
+    for a, b in zip(first, second, strict=True):
+        mean, apart, alone = 0.5 * (a + b), abs(b - a), max(a, 1.0 - a)
+        far = max(mean, 1.0 - mean)
+        if alpha:
+            alone = 2.0 / alpha * math.sin(min(0.5 * alpha * alone, 0.5 * math.pi))
+            inner = math.cos(0.5 * alpha * apart)
+            pair = 2.0 / alpha**2 * max(1.0 - inner, inner - math.cos(min(alpha * far, math.pi)))
+        else:
+            pair = max(0.25 * apart**2, far**2 - 0.25 * apart**2)
+        at_end = a in (0.0, 1.0)
+        if alternate and at_end and alpha <= math.pi:
+            found.append(_odd_peak(alpha, len(found) // 2))
+        else:
+            found.append(product * alone * (1.0 if signed and at_end and alpha <= math.pi else 2.0))
+        alternate = alternate and apart == 1.0
+        product, signed = product * pair, signed and at_end and b in (0.0, 1.0)
+        found.append(product * (1.0 if signed else 2.0))
+    return tuple(found)
+
+
+@lru_cache(maxsize=256)
+def _odd_peak(alpha: float, pairs: int) -> float:
+    r"""Maximum of the product of n pairs with nodes at both ends, and of a single function, for alpha up to pi.
+
+    For w = u - 1/2 this is :math:`(\sin(\alpha/2) + \sin\alpha w)/\alpha` times the power
+    n of :math:`2 (\cos\alpha w - \cos(\alpha/2))/\alpha^2`, which has one maximum.
+    """
+    n = pairs
+    if not alpha:
+        return float((n + 1) ** (n + 1) * n**n / (2 * n + 1) ** (2 * n + 1))
+    s, c = math.sin(0.5 * alpha), math.cos(0.5 * alpha)
+    low, high = 0.0, 0.5
+    for _ in range(40 if n else 0):  # the root of the derivative of the logarithm
+        w = alpha * 0.5 * (low + high)
+        rises = math.cos(w) * (math.cos(w) - c) > n * math.sin(w) * (s + math.sin(w))
+        low, high = (0.5 * (low + high), high) if rises else (low, 0.5 * (low + high))
+    w = alpha * high
+    found = (s + math.sin(w)) / alpha * (2.0 * (math.cos(w) - c) / alpha**2) ** n
+    return found * (1.0 + 1e-9)
+
+
+@lru_cache(maxsize=256)
+def _grid(count: int) -> Array:
+    """Evenly spaced relative times."""
+    return readonly(np.linspace(0.0, 1.0, count))
 
 
 def _constraints(

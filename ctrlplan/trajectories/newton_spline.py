@@ -16,7 +16,7 @@ from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.one_time import derivatives, is_moderate
-from ctrlplan.trajectories.swing import warn_of_swing
+from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing, within
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
 
@@ -168,7 +168,7 @@ class NewtonSpline(WaypointSpline):
 
     def _check_swing(self) -> None:
         """Warn, unless disabled, if the plan swings far beyond its waypoints."""
-        if self._options.warn:
+        if self._options.warn and not self._stays_near():
             values = np.empty((self.naxes, 2 * max([s.size for _, s, _ in self._parts]) + 1))
             for axes, system, coefficients in self._parts:
                 found = coefficients.T @ system.functions
@@ -177,11 +177,17 @@ class NewtonSpline(WaypointSpline):
                 else:
                     values[list(axes), : found.shape[1]] = found
                     values[list(axes), found.shape[1] :] = found[:, :1]
-            remedy = "use PiecewiseSpline, one polynomial per segment"
+            remedy = "use PiecewiseSpline, one polynomial per segment, or fit for samples"
             if self.alpha:
                 remedy = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {remedy}"
+            if within(values, np.array([w.position for w in self.waypoints])):
+                return  # the usual case, before derivatives are evaluated
             table, _ = given_entries(self.waypoints)
             warn_of_swing(values, np.array(self._times), table, self.end, self.labels, remedy)
+
+    def _stays_near(self) -> bool:
+        """Whether a bound of the coefficients excludes a swing."""
+        return all([system.stays_near(coefficients, MAXIMUM_SWING) for _, system, coefficients in self._parts])
 
     def resolved(self, table: NDArray[Any], digits: int) -> Self:
         """Plan with coefficients from decimal entries, where possible.

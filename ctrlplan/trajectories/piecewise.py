@@ -33,9 +33,6 @@ from ctrlplan.trajectories.waypoint_spline import (
     same_times,
 )
 
-_WITHIN = readonly(np.linspace(0.0, 1.0, 13))
-"""Relative times in a segment at which its range is measured."""
-
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
@@ -53,6 +50,10 @@ class PiecewiseSpline(WaypointSpline):
     free between prescribed ones, the minimum-jerk spline if velocities and
     accelerations are. Free entries at the ends lower the degree of the first and
     last segment. Derivatives that no waypoint prescribes may jump.
+
+    A dwell is a pair of waypoints at the same position with zero derivatives up to the
+    highest order that is prescribed for the axis: between them the plan is
+    constant. With a derivative left free, it overshoots there.
 
     Parameters
     ----------
@@ -83,6 +84,16 @@ class PiecewiseSpline(WaypointSpline):
     -----
     UserWarning
         If the plan swings far beyond its waypoints (`warn`).
+
+    Examples
+    --------
+    Rise, dwell and return of a cam:
+
+    >>> import ctrlplan as cp
+    >>> rest = (0, 0)
+    >>> cam = cp.PiecewiseSpline([cp.Waypoint(t, y, *rest) for t, y in [(0, 0), (1, 5), (3, 5), (4, 0)]])
+    >>> cam([1.5, 2.0, 2.5]), cam.jumps(2)
+    (array([5., 5., 5.]), ())
     """
 
     family = "piecewise"
@@ -361,34 +372,39 @@ class PiecewiseSpline(WaypointSpline):
 
     def _check_swing(self) -> None:
         """Warn, unless disabled, if the plan swings far beyond its waypoints."""
-        if self._warn:
-            if self._stays_near():
-                return
-            values = np.empty((self.naxes, _WITHIN.size, self.breakpoints.size - 1))
+        if self._warn and not self._stays_near():
+            ends = np.full((self.naxes, 2), [np.inf, -np.inf])
             for pieces in self._pieces:
                 for run in pieces.runs:
-                    functions, flat = run.system.taylor(_WITHIN, 0)[:, 0], run.coefficients.reshape(run.system.size, -1)
-                    found = (functions.T @ flat).reshape(_WITHIN.size, len(pieces.axes), -1)
-                    values[list(pieces.axes), :, run.first : run.last] = found.transpose(1, 0, 2)
+                    found = run.system.functions.T @ run.coefficients.reshape(run.system.size, -1)
+                    rows = found.reshape(-1, len(pieces.axes), run.last - run.first)
+                    for axis, low, high in zip(pieces.axes, rows.min(axis=(0, 2)), rows.max(axis=(0, 2)), strict=True):
+                        ends[axis] = min(ends[axis, 0], low), max(ends[axis, 1], high)
             remedy = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
-            table = self._entries.table
-            warn_of_swing(values.reshape(self.naxes, -1), self._entries.times, table, self.end, self.labels, remedy)
+            remedy += ", or use fit for samples"
+            warn_of_swing(ends, self._entries.times, self._entries.table, self.end, self.labels, remedy)
 
     def _stays_near(self) -> bool:
-        """Whether a bound of the coefficients excludes a swing: products of both distances are at most 1/4."""
+        """Whether a bound of the coefficients excludes a swing.
+
+        Of the functions of a segment the first two lead from position to position, and
+        the others add a part of their ranges to it, upwards or downwards.
+        """
+        if self.alpha > math.pi:
+            return False
         positions = np.ascontiguousarray(self._entries.table[:, 0].T)  # extrema of long rows are faster
-        with np.errstate(over="ignore", invalid="ignore"):
-            allowed = (MAXIMUM_SWING - 1.0) * (positions.max(axis=1) - positions.min(axis=1))
-            for pieces in self._pieces if not self.alpha else ():
-                reach = np.zeros(len(pieces.axes))
-                for run in (run for run in pieces.runs if run.system.size > 2):
-                    weights = 0.25 ** (np.arange(2, run.system.size) // 2)
-                    sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
-                    own = (weights @ sizes).reshape(reach.size, -1)
-                    reach = np.maximum(reach, 2.0 * own.max(axis=1))
-                if not (all(run.system.hermite for run in pieces.runs) and (reach <= allowed[list(pieces.axes)]).all()):
+        allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (positions.max(axis=1) - positions.min(axis=1))
+        for pieces in self._pieces:
+            for run in pieces.runs:
+                if not run.system.hermite:
                     return False
-        return not self.alpha
+                weights = np.array(run.system.ranges[1:])
+                if weights.size:
+                    sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
+                    own = (weights @ sizes).reshape(len(pieces.axes), -1).max(axis=1)
+                    if not (own <= allowed[list(pieces.axes)]).all():
+                        return False
+        return True
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""

@@ -133,14 +133,12 @@ class PiecewisePolynomial(Trajectory):
         inside = t.size and segments.min() >= 0 and segments.max() <= last
         if touched <= _FEW or t.size > _MANY * touched or not inside:
             return super()._sample(t, low, high, left)
-        out = np.zeros((high - low + 1, self.naxes, t.size))
+        out = np.empty((high - low + 1, self.naxes, t.size))
         with np.errstate(over="ignore", invalid="ignore"):
             for begin in range(0, t.size, _CHUNK):
                 part = slice(begin, begin + _CHUNK)
                 own = segments[part]
-                rows = shifted(self._jets[:, :, own], t[part] - self.breakpoints[own], high)[low:]
-                for k, row in enumerate(rows):
-                    out[k, :, part] = row
+                out[:, :, part] = self.segments_jet(own, t[part] - self.breakpoints[own], high)[low:]
         return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
     def stationary_places(self, nu: int) -> tuple[NDArray[np.intp], Array] | None:

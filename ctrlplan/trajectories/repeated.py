@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
-from numbers import Real
+from itertools import pairwise
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -198,17 +198,22 @@ class Repeated(Trajectory):
         segment = int(self._segments_of(np.array([moment]), False)[0])
         return self.segment_series(segment, s + (origin - float(self._times(segment))), order)
 
-    def series(self, t: Value, order: int) -> list[list[Value]]:
-        """Taylor series about one time; as `Trajectory.series`."""
-        if isinstance(t, Real | str | complex | list | tuple | np.ndarray | None):
-            return super().series(t, order)
+    def _intervals_at(self, t: Value) -> Iterator[tuple[int, Value, Value]]:
+        # The number of periods is rounded: the sums with which times of segments are computed decide.
         turn = np.fmax(np.floor((t - self.since) / self.period), 0.0)
-        beyond = 0.0
+        turn = turn + (t >= self.since + (turn + 1.0) * self.period)
+        turn = np.fmax(turn - (t < self.since + turn * self.period), 0.0)
         if self.count is not None:
             turn = np.fmin(turn, self.count - 1.0)
-            beyond = np.fmax(t - self.end, 0.0)
-        # Rounding of the number of periods does not lead beyond the end of the plan.
-        return self.plan.series(np.fmin(t - turn * self.period, self.plan.end) + beyond, order)
+        later = turn * self.period
+        times, last = self.plan.breakpoints.tolist(), self.plan.breakpoints.size - 2
+        for segment, (left, right) in enumerate(pairwise(times)):
+            if segment < self._lead:
+                yield segment, left, right
+            elif segment < last:
+                yield segment, left + later, right + later
+            else:
+                yield segment, left + later, self.since + (turn + 1.0) * self.period
 
     def breakpoints_between(self, t0: float, t1: float) -> Array:
         """Breakpoints in the half-open interval [t0, t1); as `Trajectory.breakpoints_between`.

@@ -39,9 +39,8 @@ def warn_of_swing(values: Array, times: Array, table: Array, end: float, labels:
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         plan = values.max(axis=1) - values.min(axis=1)
-        positions = table[:, 0]
-        if (plan <= MAXIMUM_SWING * (positions.max(axis=0) - positions.min(axis=0))).all():
-            return  # the common case, before derivatives are evaluated
+        if within(values, table[:, 0]):
+            return
         low, high = _data_range(times, table, end)
         # If the range is only rounding of the positions, the ratio has no meaning.
         counts = plan > 1e-9 * np.abs(values).max(axis=1)
@@ -54,6 +53,12 @@ def warn_of_swing(values: Array, times: Array, table: Array, end: float, labels:
             f"stay from {low[axis]:.6g} to {high[axis]:.6g}; {remedy}, or pass warn=False if this is intended",
             stacklevel=4,
         )
+
+
+def within(values: Array, positions: Array) -> bool:
+    """Whether the ranges of a plan (naxes, ntime) exclude a swing by positions (nwaypoints, naxes) alone."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool((np.ptp(values, axis=1) <= MAXIMUM_SWING * np.ptp(positions, axis=0)).all())
 
 
 def _data_range(times: Array, table: Array, end: float) -> tuple[Array, Array]:

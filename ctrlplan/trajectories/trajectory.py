@@ -403,14 +403,21 @@ class Trajectory(Displayed, Fields, ABC):
             raise TypeError(f"t must be one number or a symbol, got {t!r:.80}")
         # Each segment is weighted by 1 in its interval; elsewhere it is evaluated at its ends, where it is finite.
         found = [[value * (t < self.start), *[0.0] * order] for value in self.initial.tolist()]
-        for segment, (left, right) in enumerate(itertools.pairwise(self.breakpoints.tolist())):
+        for segment, left, right in self._intervals_at(t):
             holds = (t >= left) * (t < right)
             rows = self.segment_series(segment, np.fmin(np.fmax(t - left, 0.0), right - left), order)
             found = [[a + holds * b for a, b in zip(*pair, strict=True)] for pair in zip(found, rows, strict=True)]
+        if math.isinf(self.end):
+            return found
         for row, value in zip(found, self.final.tolist(), strict=True):
             row[0] = row[0] + value * (t > self.end)
         last = (self.jet(self.end, order).T / FACTORIALS[: order + 1]).tolist()
         return [[a + (t == self.end) * b for a, b in zip(*pair, strict=True)] for pair in zip(found, last, strict=True)]
+
+    def _intervals_at(self, t: Value) -> Iterator[tuple[int, Value, Value]]:
+        """Segments with the times [s] between which each of them is passed about a symbol t."""
+        for segment, (left, right) in enumerate(itertools.pairwise(self.breakpoints.tolist())):
+            yield segment, left, right
 
     def extrema(self, nu: int = 0) -> _extrema.Extrema:
         """Minimum and maximum of the nu-th derivative over the whole plan.

@@ -404,3 +404,36 @@ def test_only_segments_that_can_hold_an_extremum_are_searched(monkeypatch):
     )
     plan.extrema(1)
     assert 1 <= len(set(searched)) <= 20
+
+
+# Dwells
+
+TURN = [
+    Waypoint(0, 0.1, 0, 0),
+    Waypoint(1, 5.3, 0, 0),
+    Waypoint(2.5, 5.3, 0, 0),
+    Waypoint(3, 1.7),
+    Waypoint(4, 0.1, 0, 0),
+]
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+@pytest.mark.parametrize("kind", ["waypoints", "cyclic", "arrays", "repeated"])
+def test_a_dwell_is_constant_between_segments_that_are_not(kind, alpha):
+    """To rounding; the neighbours, one with free derivatives, join with continuous accelerations."""
+    if kind == "arrays":
+        free = np.array([0.0, 0.0, 0.0, np.nan, 0.0])
+        plan = PiecewiseSpline.from_arrays(
+            [0, 1, 2.5, 3, 4], [0.1, 5.3, 5.3, 1.7, 0.1], derivatives={1: free, 2: free}, alpha=alpha, warn=False
+        )
+    elif kind == "cyclic":
+        plan = PiecewiseSpline.cyclic(TURN[:-1], 4.0, alpha=alpha, warn=False)
+    else:
+        plan = PiecewiseSpline(TURN, alpha=alpha, warn=False)
+    plan = plan.repeat(None) if kind == "repeated" else plan
+    for begin in (0.0, 4000.0) if kind == "repeated" else (0.0,):
+        jet = plan.jet(np.linspace(begin + 1.0, begin + 2.499, 501), 4)[:, 0]
+        assert np.abs(jet[0] - 5.3).max() <= 1e-14 * 5.3
+        assert np.abs(jet[1:]).max() <= 1e-12
+    assert [jump for jump in plan.jumps(2) if 0 < jump.time < 4] == []
+    assert abs(plan(2.6) - 5.3) > 1e-3

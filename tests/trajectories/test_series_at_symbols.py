@@ -53,6 +53,9 @@ NEXT = [Waypoint.from_jets(5.0, x=[1.0, -0.3], z=[3.0, 0.1]), Waypoint.from_jets
 POLY, TRIG = PolySpline(POINTS), TrigSpline(NEXT, alpha=2.0)
 """Both end in motion: a wrong limit at an end shows."""
 
+BACK = PiecewiseSpline([*POINTS, Waypoint.from_jets(2.5, x=[0.0, 1.0], z=[1.0])])
+"""It returns to its first position with another velocity."""
+
 PLANS = {
     "PolySpline": POLY,
     "TrigSpline": TrigSpline(POINTS, alpha=1.3),
@@ -75,6 +78,7 @@ PLANS = {
     "MotionProfile": MotionProfile([-0.5, 1.0, 3.0], [[2.0, -1.0], [0.0, 0.5]], [[1.0, 2.0], [0.5, -0.3], [0.1, 0.0]]),
     "PiecewisePolynomial": PiecewisePolynomial([-0.5, 1.0, 3.0], [[[2.0, 0.3], [0.0, 0.5]], [[1.0, 2.0], [0.5, -0.3]]]),
     "TimeLaw": TimeLaw([-1.0, 0.5, 1.0, 2.0], [[0.0, 1.0, 0.5], [2.0, 0.2, 0.75], [1.0, 0.5, 1.0]], -0.5),
+    "Repeated": BACK.repeat(3),
     # kinds with options
     "of a higher degree": PolySpline(POINTS, degree=9),
     "trigonometric of a higher degree": TrigSpline(POINTS, alpha=2.0, degree=7),
@@ -314,3 +318,18 @@ def test_no_warning_of_our_own_at_a_symbol():
         for plan in PLANS.values():
             plan.series(casadi.SX.sym("t"), 3)
     assert {entry.category for entry in seen} <= {FutureWarning}
+
+
+@pytest.mark.parametrize("lead", [False, True])
+def test_plans_that_repeat_for_all_future_times(lead):
+    """At breakpoints of the first and of late periods what follows, before the start the first position."""
+    endless = BACK.repeat(None)
+    plan = rest((-4.0, (1.0, 3.0)), (-2.5, (0.0, 1.0)), labels=["x", "z"]).then(endless) if lead else endless
+    function = traced(plan, ORDER)
+    late = plan.since + 1e4 * plan.period
+    edges = [*plan.breakpoints_between(plan.start, plan.start + 12.0), *plan.breakpoints_between(late, late + 8.0)]
+    rng = np.random.default_rng(3)
+    times = [plan.start - 1.0, *edges, *rng.uniform(plan.start, 40.0, 30)]
+    size = np.abs([coefficients(plan, t, ORDER) for t in times]).max(axis=0)
+    for t in times:
+        assert (np.abs(function(t) - coefficients(plan, t, ORDER)) <= 1e-9 * size + 1e-300).all(), t

@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
-from ctrlplan.trajectories import PiecewiseSpline, PolySpline, TrigSpline, Waypoint, load_trajectory
+from ctrlplan.trajectories import (
+    PiecewiseSpline,
+    PolySpline,
+    TrigSpline,
+    Waypoint,
+    load_trajectory,
+    newton_spline,
+    piecewise,
+)
+from ctrlplan.trajectories.newton import NewtonSystem
 
 REST = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]
 
@@ -125,3 +134,64 @@ def test_choosing_alpha_warns_of_the_choice_only():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cp.choose_alpha(REST, lambda plan: -float(np.ptp(plan(np.linspace(0, 1, 101)))), warn=False)
+
+
+# The bound that decides whether a swing is measured
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0, 3.0, 3.5, 5.0, 6.2])
+def test_ranges_of_functions_are_bounded(alpha):
+    """Against 2001 values of each function; with nodes at the ends only, the bound is the range up to alpha = pi."""
+    rng = np.random.default_rng(1)
+    for case in range(24):
+        inner = rng.uniform(0.0, 1.0, case % 4)
+        times = np.sort(np.append(inner, [0.0, 1.0]))
+        given = tuple(tuple(range(count)) for count in rng.integers(1, 4, times.size).tolist())
+        system = NewtonSystem(alpha, times, given)
+        values = system.taylor(np.linspace(0.0, 1.0, 2001), 0)[:, 0]
+        ranges = np.ptp(values[1:], axis=1)
+        assert (ranges <= np.array(system.ranges) * (1.0 + 1e-12)).all()
+        if not inner.size and alpha <= math.pi and len(set(given)) == 1:
+            np.testing.assert_allclose(ranges, system.ranges, rtol=1e-5)
+        grid = system.taylor(np.linspace(0.0, 1.0, 2 * system.size + 1), 0)[:, 0]
+        np.testing.assert_allclose(system.functions, grid, rtol=0, atol=1e-13 * np.abs(grid).max())
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0, 3.0, 4.5, 5.5])
+def test_the_bound_lets_no_swing_pass(alpha):
+    """Random moves warn where the range at 1001 times is above 3 times that of the data, and only there."""
+    rng = np.random.default_rng(2)
+    for case in range(40):
+        n = 2 + case % 5
+        times = np.cumsum(rng.uniform(0.3, 2.0, n))
+        points = [Waypoint(float(t), rng.normal(), 0 if i in (0, n - 1) else None) for i, t in enumerate(times)]
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            plan = TrigSpline(points, alpha=alpha) if alpha else PolySpline(points)
+        swing = np.ptp(plan(np.linspace(times[0], times[-1], 1001))) / np.ptp([w.position[0] for w in points])
+        assert len(caught) <= 1
+        if not 2.8 < swing < 3.2:  # measured on a grid, and relative to the velocities as well
+            assert bool(caught) == (swing > 3.0), swing
+
+
+@pytest.mark.parametrize("make", [PolySpline, lambda points: TrigSpline(points, alpha=2.0), PiecewiseSpline])
+def test_moves_from_rest_to_rest_are_decided_by_the_bound(make, monkeypatch):
+    def measured(*_given):
+        raise AssertionError("the swing was measured")
+
+    monkeypatch.setattr(newton_spline, "warn_of_swing", measured)
+    monkeypatch.setattr(newton_spline, "within", measured)
+    monkeypatch.setattr(piecewise, "warn_of_swing", measured)
+    for order in (1, 2):
+        make([Waypoint(0, 3, *[0] * order), Waypoint(2, -5, *[0] * order)])
+    make([Waypoint(0, [0, 1], 0, 0), Waypoint(1, [1, 0], 0, 0)])
+
+
+def test_the_advice_names_what_to_call():
+    points = [Waypoint(float(k), (-1.0) ** k) for k in range(40)]
+    with pytest.warns(UserWarning, match="over .* times the range .* PiecewiseSpline, .*or fit for samples"):
+        PolySpline(points)
+    with pytest.warns(UserWarning, match="lower alpha from 5 .*PiecewiseSpline, .*or fit for samples"):
+        TrigSpline(REST, alpha=5.0)
+    with pytest.warns(UserWarning, match="lower alpha from 5, or use fit for samples"):
+        PiecewiseSpline(REST, alpha=5.0)

@@ -19,6 +19,7 @@ from ctrlplan.systems.feedforward.planned import PlanOptions, planned_feedforwar
 from ctrlplan.systems.feedforward.sampled import is_sampled, sampled_feedforward
 from ctrlplan.systems.feedforward.zeros import eigenvalues, largest_size, tolerance, zero_list
 from ctrlplan.trajectories import Trajectory, derivative_name
+from ctrlplan.trajectories.trajectory import check_end
 
 
 @former_signature("label", "name", renamed={"label": "labels"}, implied={"label": {"suffix": ""}})
@@ -211,6 +212,7 @@ def _checked_options(
     """Arguments for a plan, checked."""
     if plan is not None:
         check_kind(plan, "plan", Trajectory)
+        check_end(plan)
     if method not in ("exact", "zpetc"):
         raise ValueError(f'method must be "exact" or "zpetc", got {method!r:.80}')
     if not isinstance(finite, bool | np.bool_):
