@@ -20,7 +20,7 @@ from ctrlplan.trajectories.conjugate import FreeEntries, Kind, kinds_of, rounded
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.pieces import Pieces, fitted, scales
-from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
+from ctrlplan.trajectories.piecewise_extrema import Polynomials, bernstein, stationary_places
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
@@ -375,20 +375,21 @@ class PiecewiseSpline(WaypointSpline):
             warn_of_swing(values.reshape(self.naxes, -1), self._entries.times, table, self.end, self.labels, remedy)
 
     def _stays_near(self) -> bool:
-        """Whether a bound of the coefficients excludes a swing: products of both distances are at most 1/4."""
+        """Whether the Bernstein coefficients of polynomials, which enclose them, exclude a swing."""
+        if self.alpha:
+            return False
         positions = np.ascontiguousarray(self._entries.table[:, 0].T)  # extrema of long rows are faster
         with np.errstate(over="ignore", invalid="ignore"):
-            allowed = (MAXIMUM_SWING - 1.0) * (positions.max(axis=1) - positions.min(axis=1))
-            for pieces in self._pieces if not self.alpha else ():
-                reach = np.zeros(len(pieces.axes))
-                for run in (run for run in pieces.runs if run.system.size > 2):
-                    weights = 0.25 ** (np.arange(2, run.system.size) // 2)
-                    sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
-                    own = (weights @ sizes).reshape(reach.size, -1)
-                    reach = np.maximum(reach, 2.0 * own.max(axis=1))
-                if not (all(run.system.hermite for run in pieces.runs) and (reach <= allowed[list(pieces.axes)]).all()):
+            allowed = MAXIMUM_SWING * (positions.max(axis=1) - positions.min(axis=1))
+            for pieces in self._pieces:
+                low, high = np.full(len(pieces.axes), np.inf), np.full(len(pieces.axes), -np.inf)
+                for run in pieces.runs:
+                    values = bernstein(run.system, 0, 1)[0] @ run.coefficients.reshape(run.system.size, -1)
+                    low = np.minimum(low, values.min(axis=0).reshape(low.size, -1).min(axis=1))
+                    high = np.maximum(high, values.max(axis=0).reshape(low.size, -1).max(axis=1))
+                if not (high - low <= allowed[list(pieces.axes)]).all():
                     return False
-        return not self.alpha
+        return True
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
