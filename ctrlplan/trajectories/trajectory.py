@@ -1115,7 +1115,7 @@ class Trajectory(Displayed, Fields, ABC):
         if abs(math.log10(duration)) * high > 200.0:
             return _placed(self._extreme_jet(segment, s, low, high), out)
         with np.errstate(over="ignore", invalid="ignore"):
-            if s.size <= _sampling.FEW:
+            if s.size <= _sampling.FEW or not self.naxes:
                 found = _placed(self.segment_jet(segment, s, high)[low:], out)
             else:
                 found = np.empty((high - low + 1, self.naxes, s.size)) if out is None else out
