@@ -14,6 +14,7 @@ from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
+from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.swing import warn_of_swing
@@ -210,7 +211,9 @@ class NewtonSpline(WaypointSpline):
         options = self._options
         if options.period is not None:
             options = options._replace(period=options.period / rate)
-        return self._again(moved, options)
+        plan = self._again(moved, options)
+        keep_places(self, plan)
+        return plan
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
