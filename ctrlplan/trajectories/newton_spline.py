@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
@@ -232,6 +233,12 @@ class NewtonSpline(WaypointSpline):
                 return values
             out[:, list(axes)] = values
         return out
+
+    def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
+        # More terms than functions, as a trigonometric function is no polynomial.
+        degree = max(system.size for _, system, _ in self._parts) + (8 if self.alpha else 0)
+        interval = (0.0, float(self.breakpoints[1] - self.breakpoints[0]))
+        return chebyshev_proxy(lambda s, order: self.segment_jet(0, s, order), interval, low, high, degree)
 
     def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
         """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""

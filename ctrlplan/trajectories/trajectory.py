@@ -113,7 +113,8 @@ class Trajectory(Displayed, Fields, ABC):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         # A method for many times that is overridden holds for one time as well.
-        for many, one in (("segment_jet", "segment_rows"), ("_sample", "_rows")):
+        pairs = (("segment_jet", "segment_rows"), ("segment_jet_at", "segment_rows_at"), ("_sample", "_rows"))
+        for many, one in pairs:
             if many in cls.__dict__ and one not in cls.__dict__:
                 setattr(cls, one, _no_rows)
         abstract = (getattr(f, "__isabstractmethod__", False) for f in (cls.segment_jet, cls.map_time, cls.from_dict))
@@ -1138,12 +1139,20 @@ class Trajectory(Displayed, Fields, ABC):
         length = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
         _sampling.sample(jet, known[key], length, s, (low, high), out)
         for k in (0, -1):  # the ends have the entries of waypoints in every bit
-            if s[k] in (0.0, length):
-                out[:, :, k] = jet(s[[k]], high)[low:, :, 0]
+            end = float(s[k])
+            if end in (0.0, length):
+                if (segment, end, high) not in self._end_jets:
+                    self._end_jets[segment, end, high] = jet(s[[k]], high)[:, :, 0]
+                out[:, :, k] = self._end_jets[segment, end, high][low:]
 
     @cached_property
     def _proxies(self) -> dict[tuple[int, int, int], Array | None]:
         """Chebyshev coefficients of derivatives, by segment, lowest and highest order."""
+        return {}
+
+    @cached_property
+    def _end_jets(self) -> dict[tuple[int, float, int], Array]:
+        """Jets at ends of segments, by segment, time from its start and order."""
         return {}
 
     def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
