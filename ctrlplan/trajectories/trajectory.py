@@ -1091,21 +1091,21 @@ class Trajectory(Displayed, Fields, ABC):
         if nsegments and not left:
             segments[t == self.breakpoints[-1]] = nsegments - 1
         out = np.zeros((high - low + 1, self.naxes, t.size))
-        in_order = bool(np.all(segments[1:] >= segments[:-1]))
-        touched = segments[np.flatnonzero(np.diff(segments, prepend=-2))] if in_order else np.unique(segments)
-        for segment in touched.tolist():
-            where: slice | NDArray[np.intp]
-            if in_order:
-                begin, end = np.searchsorted(segments, [segment, segment + 1]).tolist()
-                where = slice(begin, end)
-            else:
-                where = np.flatnonzero(segments == segment)
+        if (segments[1:] >= segments[:-1]).all():
+            edges = (np.flatnonzero(segments[1:] != segments[:-1]) + 1).tolist()
+            parts: list[slice | NDArray[np.intp]] = [
+                slice(begin, end) for begin, end in itertools.pairwise([0, *edges, t.size] if t.size else [])
+            ]
+        else:
+            parts = [np.flatnonzero(segments == segment) for segment in np.unique(segments)]
+        for where in parts:
+            segment = int(segments[where][0])
             if 0 <= segment < nsegments:
-                part = t[where] - self.breakpoints[segment]
-                if in_order:
-                    self._sample_segment(segment, part, low, high, out[:, :, where])
+                s = t[where] - self.breakpoints[segment]
+                if isinstance(where, slice):
+                    self._sample_segment(segment, s, low, high, out[:, :, where])
                 else:
-                    out[:, :, where] = self._sample_segment(segment, part, low, high)
+                    out[:, :, where] = self._sample_segment(segment, s, low, high)
             elif low == 0:
                 out[0][:, where] = (self.initial if segment < 0 else self.final)[:, None]
         return out
