@@ -18,6 +18,7 @@ from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.repeated import one_pass
 
 _TIGHT = 1e-6  # relative gap between the bound and the attained minimum, unless a clearance is required
+_TOGETHER = 512  # cells up to which their number does not matter for the time of one refinement
 _ROUNDING = 1e-9  # of the coordinates: a plan at rest at exactly the required clearance is certified
 
 
@@ -179,9 +180,7 @@ def clearance(
                 )
             open_[:] = False
         lower = min(lower, float(bound[~open_].min(initial=np.inf)))
-        middle = 0.5 * (left + right)[open_]
-        left = np.stack([left[open_], middle], axis=1).ravel()
-        right = np.stack([middle, right[open_]], axis=1).ravel()
+        left, right = _divided(left[open_], right[open_], min(_TOGETHER, max_cells - spent))
     return cells.result(lower, goal, None if goal is None else lower >= goal - slack)
 
 
@@ -203,6 +202,14 @@ def checked_rope(rope: Rope | None) -> Rope | None:
     if rope is not None and not isinstance(rope, Rope):
         raise TypeError(f"rope must be a rope such as crane.rope(), got {rope!r:.60}")
     return rope
+
+
+def _divided(left: Array, right: Array, maximum: int) -> tuple[Array, Array]:
+    """Cells divided in two, or in eight if these are not more than a maximum."""
+    parts = 8 if 8 * left.size <= maximum else 2
+    edges = left[:, None] + (right - left)[:, None] * (np.arange(parts + 1) / parts)
+    edges[:, -1] = right
+    return edges[:, :-1].ravel(), edges[:, 1:].ravel()
 
 
 class _Cells:

@@ -42,6 +42,9 @@ from ctrlplan.trajectories.waypoint import Entries, entry_name, waypoint_table
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
 _EPS = float(np.finfo(float).eps)
+_LIMITED_MEMORY = {"maxcor": 30, "gtol": 1e-7, "ftol": 1e-14, "maxiter": 10_000, "maxfun": 20_000}
+"""Options of the minimisation over times."""
+
 _FEW, _NONE = 1e-6, 1e-2  # estimated relative error of the cost above which a warning, an error is raised
 
 
@@ -513,7 +516,8 @@ def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Arra
     def best_from(start: Array) -> tuple[float, Array]:
         h = np.maximum(start / start.sum(), 2.0 * minimum)
         x = np.log(h / h.sum() - minimum)
-        result = minimize(objective, x, jac=True, method="BFGS", options={"gtol": 1e-7})
+        # Without a matrix of the size of the problem, whose products in threads would take most of the time.
+        result = minimize(objective, x, jac=True, method="L-BFGS-B", options=_LIMITED_MEMORY)
         return float(result.fun), _times(durations(result.x)[0])
 
     starts = [segments, *(chord**power for power in (1.0, 0.5, 1.0 / 3.0, 0.0))]

@@ -459,9 +459,10 @@ class _Correction(SampledBlock):
 
     def _deviation(self, t: float, x: Array, u: Array) -> Array:
         """Jet (order + 1, naxes) at the start of a fit, minus that of the plan."""
-        highest = self._signals.measured
+        highest, stopped = self._signals.measured, self._is_stopped(x)
+        if highest is None and not stopped:
+            return self._jets(t, x, self._order)
         planned = u[: len(self._signals.inner)].reshape(self._naxes, -1).T
-        stopped = self._is_stopped(x)
         if highest == self._order:
             own = planned[:0]
         elif stopped:

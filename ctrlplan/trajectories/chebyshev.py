@@ -14,17 +14,17 @@ _DEGREES = (16, 32, 64, 128)
 
 
 def chebyshev_proxy(
-    jet: Callable[[Array, int], Array], interval: tuple[float, float], low: int, high: int
+    jet: Callable[[Array, int], Array], interval: tuple[float, float], low: int, high: int, degree: int = 0
 ) -> Array | None:
-    """Chebyshev coefficients of derivatives low to high, each from exact values.
+    """Chebyshev coefficients of derivatives low to high, each from exact values, of a degree or a higher one.
 
     Returns
     -------
     ndarray, shape (high - low + 1, naxes, size), or None
         None where degree 128 does not resolve the function.
     """
-    for degree in _DEGREES:
-        values = jet(points(degree, *interval), high)[low:]
+    for number in (d for d in _DEGREES if d >= min(degree, _DEGREES[-1])):
+        values = jet(points(number, *interval), high)[low:]
         coefficients = transform(values)
         used = resolved_size(coefficients)
         if used is not None:

@@ -101,25 +101,6 @@ class Clipped(Trajectory):
     def _has_quick_peaks(self) -> bool:
         return super()._has_quick_peaks() and self.plan._has_quick_peaks()
 
-    def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
-        inside = (t > self.start if left else t >= self.start) & (t < self.end)
-        if inside.all():
-            return self.plan._sample(t, low, high, left)
-        out = np.zeros((high - low + 1, self.naxes, t.size))
-        if low == 0:
-            out[0] = np.where(t < self.end, self.initial[:, None], self.final[:, None])
-        for where, side in ((inside, left), (t == self.end, True)):
-            if where.any():
-                out[:, :, where] = self.plan._sample(t[where], low, high, side)
-        return out
-
-    def _rows(self, t: float, order: int, left: bool) -> list[list[float]] | None:
-        """Derivatives at one time; as `Trajectory._rows`."""
-        start, end = self._moments[0], self._moments[-1]
-        if t == end or (start < t < end) or (t == start and not left):
-            return self.plan._rows(t, order, left or t == end)
-        return super()._rows(t, order, left)
-
     def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
         """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""
         return self.plan.segment_rows(self._first + segment, s + float(self._shifts[segment]), order)

@@ -77,6 +77,17 @@ _KNOWN: WeakKeyDictionary[Trajectory, dict[int, Extrema]] = WeakKeyDictionary()
 """Extrema of derivatives by plan, which is immutable, and order."""
 
 
+_PLACES: WeakKeyDictionary[Trajectory, dict[tuple[int, int], Array]] = WeakKeyDictionary()
+"""Candidates for extrema by plan, order and segment, relative to the duration of the segment."""
+
+
+def keep_places(plan: Trajectory, moved: Trajectory) -> None:
+    """Keep the places of extrema of a plan for the same path at other times, where values are computed again."""
+    places = _PLACES.get(plan)
+    if places is not None:
+        _PLACES[moved] = dict(places)
+
+
 def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     """Extrema of the nu-th derivative, axis by axis; computed once for a plan, returned as the caller's own."""
     known = _KNOWN.setdefault(plan, {})
@@ -126,7 +137,13 @@ def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None
     def jet(t: Array, order: int) -> Array:
         return plan.segment_jet(segment, t, order)
 
-    t = stationary_times(jet, float(plan.breakpoints[segment + 1] - plan.breakpoints[segment]), nu)
+    duration = float(plan.breakpoints[segment + 1] - plan.breakpoints[segment])
+    places = _PLACES.setdefault(plan, {})
+    if (nu, segment) in places:
+        t = _with_polished(jet, places[nu, segment] * duration, nu, duration)
+    else:
+        t = stationary_times(jet, duration, nu)
+        places[nu, segment] = t / duration
     times, ends = _placed(plan, segment, t)
     found.add(times, jet(t, nu)[nu], ends)
 
@@ -180,7 +197,11 @@ def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: in
     times = [np.array([0.0, duration])]
     for left, right, slopes in _pieces(jet, 0.0, duration, nu + 1):
         times.append(0.5 * (left + right) + 0.5 * (right - left) * roots_of_rows(slopes)[1])
-    t = np.concatenate(times)
+    return _with_polished(jet, np.concatenate(times), nu, duration)
+
+
+def _with_polished(jet: Callable[[Array, int], Array], t: Array, nu: int, duration: float) -> Array:
+    """Candidate times, increasing, with those after a Newton step."""
     t = np.concatenate([t, _polished(jet, t, nu, duration)])
     # Candidates within rounding of an end are that end.
     t[t < 1e-12 * duration] = 0.0

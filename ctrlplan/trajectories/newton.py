@@ -60,6 +60,9 @@ from ctrlplan.trajectories.quadrature import gauss
 _MEET = 0.25
 """The ends coincide if their distance on the circle is below this fraction of that to all neighbours."""
 
+_PRODUCT = 1e3
+"""Amplification of rounding errors up to which the inverse is as accurate as a triangular solution."""
+
 _SUSPECT = 1e5
 """Amplification of rounding errors above which the loss of accuracy is estimated."""
 
@@ -192,6 +195,24 @@ class NewtonSystem(Fields):
         found = solved if self._spread is None else self._spread @ solved
         found[0] += offset
         return found
+
+    def coefficients_of_many(self, taylor_data: NDArray[Any]) -> Array:
+        """The same for many columns, by one product where that loses no digits."""
+        if self._inverse is None or taylor_data.dtype != np.float64:
+            return self.coefficients_of(taylor_data)
+        offset = taylor_data[self._anchor].copy()
+        shifted = taylor_data.copy()
+        shifted[self._positions[:, 0] > 0.0] -= offset
+        found: Array = self._inverse @ shifted
+        found[0] += offset
+        return found
+
+    @cached_property
+    def _inverse(self) -> Array | None:
+        """Matrix from Taylor data to coefficients; None where it loses digits."""
+        if self._spread is not None or not self._positions[self._anchor, 0] or self.amplification > _PRODUCT:
+            return None
+        return readonly(np.ascontiguousarray(blas.dtrsm(1.0, self._triangle, np.eye(self.size), lower=1)))
 
     def coefficients_of(self, taylor_data: NDArray[Any]) -> Array:
         """The same for entries of a complete jet at each waypoint, with the digits of extended numbers."""

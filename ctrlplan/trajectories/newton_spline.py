@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
+from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing, within
@@ -216,7 +218,9 @@ class NewtonSpline(WaypointSpline):
         options = self._options
         if options.period is not None:
             options = options._replace(period=options.period / rate)
-        return self._again(moved, options)
+        plan = self._again(moved, options)
+        keep_places(self, plan)
+        return plan
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
@@ -235,6 +239,12 @@ class NewtonSpline(WaypointSpline):
                 return values
             out[:, list(axes)] = values
         return out
+
+    def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
+        # More terms than functions, as a trigonometric function is no polynomial.
+        degree = max(system.size for _, system, _ in self._parts) + (8 if self.alpha else 0)
+        interval = (0.0, float(self.breakpoints[1] - self.breakpoints[0]))
+        return chebyshev_proxy(lambda s, order: self.segment_jet(0, s, order), interval, low, high, degree)
 
     def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
         """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""

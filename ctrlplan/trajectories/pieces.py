@@ -132,7 +132,7 @@ def fitted(
             if alpha > NEARLY_CLOSED or system.amplification > _AMPLIFIED:
                 found = _carefully_solved(system, kind, table.astype(float), data.astype(float), times)
             else:
-                found = system.coefficients_of(data.reshape(len(data), -1))
+                found = system.coefficients_of_many(data.reshape(len(data), -1))
                 found = np.ascontiguousarray(found).reshape(system.size, *data.shape[1:])
         if not np.isfinite(found.sum()) and not np.isfinite(found).all():
             wrong = ~np.isfinite(found).all(axis=(0, 1))

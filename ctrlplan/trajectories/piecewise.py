@@ -20,7 +20,7 @@ from ctrlplan.trajectories.conjugate import FreeEntries, Kind, kinds_of, rounded
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.pieces import Pieces, fitted, scales
-from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
+from ctrlplan.trajectories.piecewise_extrema import Polynomials, bernstein, stationary_places
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
@@ -36,8 +36,8 @@ from ctrlplan.trajectories.waypoint_spline import (
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
-_MANY = 200
-"""Number of times in each segment above which segments are evaluated one after the other."""
+_FEW, _MANY = 16, 200
+"""Number of segments up to which each is evaluated by itself, and number of times in each above which it is."""
 
 
 class PiecewiseSpline(WaypointSpline):
@@ -467,7 +467,7 @@ class PiecewiseSpline(WaypointSpline):
             segments[t == times[-1]] = last
         inside = (segments >= 0) & (segments <= last)
         touched = min(int(np.count_nonzero(np.diff(segments))) + 1, last + 1)
-        if touched == 1 or t.size > _MANY * touched or self._is_extreme(high) or not inside.all():
+        if touched <= _FEW or t.size > _MANY * touched or self._is_extreme(high) or not inside.all():
             return super()._sample(t, low, high, left)
         with np.errstate(over="ignore", invalid="ignore"):
             out = self._jets(segments, t - times[segments], low, high)

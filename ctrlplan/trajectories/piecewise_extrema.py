@@ -131,10 +131,10 @@ def stationary_places(groups: Iterable[Sequence[Polynomials]], durations: Array,
 
 
 @lru_cache(maxsize=128)
-def bernstein(basis: Basis, nu: int) -> Array:
+def bernstein(basis: Basis, nu: int, parts: int = _PARTS) -> Array:
     """Bernstein coefficients (nparts, degree + 1, size) of a derivative of the basis by relative time."""
     degree = max(basis.size - 1 - nu, 0)
-    powers = _powers(basis, np.arange(_PARTS) / _PARTS, nu, 1.0 / _PARTS)
+    powers = _powers(basis, np.arange(parts) / parts, nu, 1.0 / parts)
     return readonly(bernstein_of_powers(degree) @ powers)
 
 

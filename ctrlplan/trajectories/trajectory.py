@@ -113,7 +113,8 @@ class Trajectory(Displayed, Fields, ABC):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         # A method for many times that is overridden holds for one time as well.
-        for many, one in (("segment_jet", "segment_rows"), ("_sample", "_rows")):
+        pairs = (("segment_jet", "segment_rows"), ("segment_jet_at", "segment_rows_at"), ("_sample", "_rows"))
+        for many, one in pairs:
             if many in cls.__dict__ and one not in cls.__dict__:
                 setattr(cls, one, _no_rows)
         abstract = (getattr(f, "__isabstractmethod__", False) for f in (cls.segment_jet, cls.map_time, cls.from_dict))
@@ -1097,21 +1098,21 @@ class Trajectory(Displayed, Fields, ABC):
         if nsegments and not left:
             segments[t == self.breakpoints[-1]] = nsegments - 1
         out = np.zeros((high - low + 1, self.naxes, t.size))
-        in_order = bool(np.all(segments[1:] >= segments[:-1]))
-        touched = segments[np.flatnonzero(np.diff(segments, prepend=-2))] if in_order else np.unique(segments)
-        for segment in touched.tolist():
-            where: slice | NDArray[np.intp]
-            if in_order:
-                begin, end = np.searchsorted(segments, [segment, segment + 1]).tolist()
-                where = slice(begin, end)
-            else:
-                where = np.flatnonzero(segments == segment)
+        if (segments[1:] >= segments[:-1]).all():
+            edges = (np.flatnonzero(segments[1:] != segments[:-1]) + 1).tolist()
+            parts: list[slice | NDArray[np.intp]] = [
+                slice(begin, end) for begin, end in itertools.pairwise([0, *edges, t.size] if t.size else [])
+            ]
+        else:
+            parts = [np.flatnonzero(segments == segment) for segment in np.unique(segments)]
+        for where in parts:
+            segment = int(segments[where][0])
             if 0 <= segment < nsegments:
-                part = t[where] - self.breakpoints[segment]
-                if in_order:
-                    self._sample_segment(segment, part, low, high, out[:, :, where])
+                s = t[where] - self.breakpoints[segment]
+                if isinstance(where, slice):
+                    self._sample_segment(segment, s, low, high, out[:, :, where])
                 else:
-                    out[:, :, where] = self._sample_segment(segment, part, low, high)
+                    out[:, :, where] = self._sample_segment(segment, s, low, high)
             elif low == 0:
                 out[0][:, where] = (self.initial if segment < 0 else self.final)[:, None]
         return out
@@ -1122,7 +1123,7 @@ class Trajectory(Displayed, Fields, ABC):
         if abs(math.log10(duration)) * high > 200.0:
             return _placed(self._extreme_jet(segment, s, low, high), out)
         with np.errstate(over="ignore", invalid="ignore"):
-            if s.size <= _sampling.FEW:
+            if s.size <= _sampling.FEW or not self.naxes:
                 found = _placed(self.segment_jet(segment, s, high)[low:], out)
             else:
                 found = np.empty((high - low + 1, self.naxes, s.size)) if out is None else out
@@ -1145,12 +1146,20 @@ class Trajectory(Displayed, Fields, ABC):
         length = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
         _sampling.sample(jet, known[key], length, s, (low, high), out)
         for k in (0, -1):  # the ends have the entries of waypoints in every bit
-            if s[k] in (0.0, length):
-                out[:, :, k] = jet(s[[k]], high)[low:, :, 0]
+            end = float(s[k])
+            if end in (0.0, length):
+                if (segment, end, high) not in self._end_jets:
+                    self._end_jets[segment, end, high] = jet(s[[k]], high)[:, :, 0]
+                out[:, :, k] = self._end_jets[segment, end, high][low:]
 
     @cached_property
     def _proxies(self) -> dict[tuple[int, int, int], Array | None]:
         """Chebyshev coefficients of derivatives, by segment, lowest and highest order."""
+        return {}
+
+    @cached_property
+    def _end_jets(self) -> dict[tuple[int, float, int], Array]:
+        """Jets at ends of segments, by segment, time from its start and order."""
         return {}
 
     def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:

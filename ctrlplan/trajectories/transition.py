@@ -70,8 +70,7 @@ class Transition(Displayed, Fields):
     rate: float
     _system: NewtonSystem
     _rows: NDArray[np.intp]
-    _matrix: Array | None  # from scaled jets without the position at the start to scaled coefficients
-    _jet_scale: Array
+    _matrix: Array | None  # from jets relative to the position at the start to coefficients
     _data_scale: Array
     _time_scale: Array
 
@@ -93,8 +92,9 @@ class Transition(Displayed, Fields):
             rate=alpha / horizon,
             _system=family.system,
             _rows=family.rows,
-            _matrix=family.matrix,
-            _jet_scale=(powers[family.jet_orders] * family.jet_inverse)[:, None],
+            _matrix=None
+            if family.matrix is None
+            else family.matrix * (powers[family.jet_orders] * family.jet_inverse)[1:] / powers[:, None],
             _data_scale=(powers[family.system.order_index] * family.inverse)[:, None],
             _time_scale=(1.0 / powers)[:, None],
         )
@@ -126,11 +126,11 @@ class Transition(Displayed, Fields):
         ndarray, shape (2 (order + 1), naxes)
         """
         if self._matrix is not None:
-            scaled = jets * self._jet_scale
-            scaled[self.order + 1] -= scaled[0]  # relative to the start, as in `NewtonSystem.coefficients`
-            found = self._matrix @ scaled[1:]
-            found[0] += scaled[0]
-            return np.asarray(found * self._time_scale)
+            own = jets[1:].copy()
+            own[self.order] -= jets[0]  # relative to the start, as in `NewtonSystem.coefficients`
+            solved: Array = self._matrix @ own
+            solved[0] += jets[0]
+            return solved
         data = jets[self._rows]
         found = self._system.fitted(data, (0.0, self.horizon), self.horizon, data * self._data_scale)
         return found * self._time_scale

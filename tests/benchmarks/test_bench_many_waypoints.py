@@ -260,3 +260,25 @@ def test_growth_of_what_uses_a_plan(benchmark, capsys, tmp_path):
             cells = ", ".join(f"{factor * value:.3g}" for value in values)
             print(f"\n{name}: {cells} {unit}; growth {values[-1] / max(values[0], 1e-9):.0f} for 100", end="")
         print()
+
+
+@pytest.mark.benchmark
+def test_free_times_next_to_given_times(benchmark, capsys):
+    """Peer: the same optimum at given times, of which a search over times needs many."""
+    times, sizes = [], (10, 100, 300)
+    for n in sizes:
+        t, y, _, _ = data(n)
+        rest = [np.zeros(3)] * 2
+        points = [
+            cp.Waypoint(moment, position, *(rest if i in (0, n - 1) else []))
+            for i, (moment, position) in enumerate(zip(t.tolist(), y.T, strict=True))
+        ]
+        given = cp.optimize_waypoints(points)
+        begin = process_time()
+        free = cp.optimize_waypoints(points, free_times=True)
+        middle = process_time()
+        cp.optimize_waypoints(points)
+        times.append((middle - begin, process_time() - middle))
+        assert free.cost < given.cost
+    benchmark.pedantic(lambda: cp.optimize_waypoints(points[:30], free_times=True), rounds=2)
+    report(capsys, benchmark, "optimize_waypoints(free_times=True) next to given times", times, sizes)

@@ -162,3 +162,39 @@ def test_fastest_next_to_the_closed_form_on_samples(benchmark, capsys, name):
     own, other = (1e3 * median(column) for column in zip(*rows, strict=True))
     with capsys.disabled():
         print(f"\nfastest, {name}: {own:.2f} ms, closed form on 2001 samples {other:.2f} ms, ratio {ratio:.1f}")
+
+
+OBSTACLES = [cp.Rectangle((8.0, 15.0), (20.0, 60.0)), cp.Disc((3.0, 3.0), 1.0)]
+
+
+@pytest.mark.benchmark(group="clearance")
+@pytest.mark.parametrize("rope", [None, CRANE.rope()], ids=["load", "load and rope"])
+@pytest.mark.parametrize("kind", [cp.TrigSpline, cp.PiecewiseSpline])
+def test_clearance_next_to_dense_samples(benchmark, capsys, kind, rope):
+    """Peer: 20,001 samples, which certify nothing. Goal: at most 2."""
+    options = {"alpha": 4.0 if kind is cp.TrigSpline else 0.0}
+    plans = [kind(POINTS, **options) for _ in range(7)]
+
+    def peer(plan):
+        jet = plan.jet(np.linspace(plan.start, plan.end, 20_001), 0 if rope is None else rope.order)
+        found = min(float(thing.distance(jet[0]).min()) for thing in OBSTACLES)
+        if rope is None:
+            return found
+        return min(found, *(float(thing.segment_distance(rope.top(jet), jet[0]).min()) for thing in OBSTACLES))
+
+    rows = []
+    for plan in plans:
+        row = []
+        for function in (peer, lambda plan: cp.clearance(plan, OBSTACLES, rope=rope)):
+            begin = process_time()
+            found = function(plan)
+            row.append(process_time() - begin)
+        rows.append(row)
+        assert found.lower <= min(found.minimum, peer(plan))
+        assert found.minimum == pytest.approx(peer(plan), abs=1e-3)
+    ratio = median(b / a for a, b in rows)
+    benchmark.extra_info["ratio"] = ratio
+    benchmark.pedantic(lambda: cp.clearance(plans[0], OBSTACLES, rope=rope), rounds=3)
+    other, own = (1e3 * median(column) for column in zip(*rows, strict=True))
+    with capsys.disabled():
+        print(f"\nclearance, {kind.__name__}, rope {rope is not None}: {own:.2f} / {other:.2f} ms, ratio {ratio:.1f}")

@@ -101,3 +101,31 @@ def test_one_step(benchmark, capsys, kind):
             f"\nreplanning {kind}: {own:.1f} us, BPoly.from_derivatives {other:.1f} us, ratio {ratio:.2f}; "
             f"Ruckig in C++ {RUCKIG} us (stored)"
         )
+
+
+@pytest.mark.benchmark(group="replanning")
+def test_one_step_with_limits_next_to_one_without(benchmark, capsys):
+    """Limits that a bound of the coefficients decides. Goal: at most 1.5."""
+    options = KINDS["within limits, to a goal"]
+    limited, free = (
+        cp.create_replanner_iosystem(PLAN, PERIOD, **given).syslist[1]
+        for given in (options, options | {"limits": None})
+    )
+    inputs, times = cases(free, options)[:500], []
+    for t, x, u, _, _ in inputs[::50]:
+        np.testing.assert_array_equal(limited.sample(t, x, u, {}), free.sample(t, x, u, {}))
+    for first in range(0, 500, 50):
+        seconds = []
+        for core in (limited, free):
+            begin = perf_counter()
+            for t, x, u, _, _ in inputs[first : first + 50]:
+                core.sample(t, x, u, {})
+            seconds.append((perf_counter() - begin) / 50)
+        times.append(seconds)
+    t, x, u, _, _ = inputs[0]
+    benchmark.pedantic(lambda: limited.sample(t, x, u, {}), rounds=20)
+    own, other = (1e6 * median(column) for column in zip(*times, strict=True))
+    ratio = median(a / b for a, b in times)
+    benchmark.extra_info["ratio"] = ratio
+    with capsys.disabled():
+        print(f"\nreplanning within limits: {own:.1f} us, without {other:.1f} us, ratio {ratio:.2f}")

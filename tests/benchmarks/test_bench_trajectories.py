@@ -206,3 +206,32 @@ def test_one_time_next_to_horner(benchmark, capsys, kind, naxes):
     benchmark.pedantic(lambda: plan.jet(0.7, 3), rounds=5, iterations=100)
     with capsys.disabled():
         print(f"\none time, {kind}, {naxes} axes: " + "; ".join(cells))
+
+
+@pytest.mark.benchmark(group="sample")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("grid", ["uniform", "sorted"])
+def test_position_and_two_derivatives_at_some_times(benchmark, capsys, kind, grid):
+    """Peer: PPoly and its derivatives. Goals: 1.5 the first time and 1 after, 0.5 for 10,000 times."""
+    cells = []
+    for count in (1000, 4096, 10_000):
+        quintics = PPoly.from_bernstein_basis(BPoly.from_derivatives(TIMES, JETS))
+        parts = [quintics, quintics.derivative(), quintics.derivative(2)]
+        t = np.linspace(0, 10, count) if grid == "uniform" else np.sort(RNG.uniform(0, 10, count))
+        plans = [KINDS[kind](points(TIMES)) for _ in range(9)]
+        exact = np.concatenate([plans[0].jet(part, 2) for part in np.array_split(t, count // 100)], axis=2)
+        assert (np.abs(plans[0].jet(t, 2) - exact) <= 1e-12 * np.abs(exact).max(axis=2, keepdims=True)).all()
+        times = []
+        for plan in plans[1:]:
+            row = []
+            for function in (plan.jet, plan.jet, lambda t, _, parts=parts: [part(t) for part in parts]):
+                begin = process_time()
+                function(t, 2)
+                row.append(process_time() - begin)
+            times.append(row)
+        first, again = (median(row[k] / row[2] for row in times) for k in (0, 1))
+        cells.append(f"{count}: {first:.2f}, {again:.2f}")
+    benchmark.extra_info["ratio"] = again
+    benchmark.pedantic(lambda: plan.jet(t, 2), rounds=5)
+    with capsys.disabled():
+        print(f"\nsamples, {kind}, {grid}: the first time and after: " + "; ".join(cells))

@@ -22,6 +22,7 @@ from scipy.interpolate import BPoly
 
 import ctrlplan as cp
 from ctrlplan import Waypoint
+from ctrlplan.systems import replanner
 
 # Limits
 
@@ -224,3 +225,21 @@ def test_values_that_are_not_finite_leave_the_plan_unchanged(value):
         after = core.sample(1.5, before, u, {})
         assert after[2] == 1.0
         assert np.array_equal(np.delete(after, 2), np.delete(before, 2))
+
+
+def test_limits_that_bounds_of_the_coefficients_satisfy_are_not_searched(monkeypatch):
+    """The same fit with and without far limits; near ones are searched."""
+    plan = cp.PolySpline([cp.Waypoint(0, [0, 0], 0, 0), cp.Waypoint(10, [1, -2], 0, 0)], labels=["x", "z"])
+    searched = []
+    before = replanner.stationary_times
+    monkeypatch.setattr(replanner, "stationary_times", lambda *given: searched.append(given) or before(*given))
+    found = []
+    for limits in (None, {0: 1e3, 1: 1e3, 2: 1e4}, {1: 3.9}):
+        options = {"horizon": 1.0, "goal_derivatives": 0, "limits": limits}
+        core = cp.create_replanner_iosystem(plan, 0.01, **options).syslist[1]
+        state = np.zeros(core.nstates)
+        inputs = np.concatenate([plan.jet(2.0, 2).T.ravel(), [3.0, -1.0]])
+        found.append((core.sample(2.0, state, inputs, {}), len(searched)))
+    np.testing.assert_array_equal(found[1][0], found[0][0])
+    assert (found[0][1], found[1][1]) == (0, 0)
+    assert found[2][1] > 0  # peaks of 3.75 of the correction and of 0.375 of the plan, at different times

@@ -27,7 +27,9 @@ def test_three_segments_are_three_runs_of_a_single_segment(alpha):
     for k in range(3):
         pair, inside = slice(k, k + 2), np.linspace(TIMES[k], TIMES[k + 1], 30)[:-1]
         alone = TrigSpline(waypoints(TIMES[pair], JETS[pair]), alpha=alpha)
-        np.testing.assert_array_equal(plan.jet(inside, 4), alone.jet(inside, 4))
+        found, same = plan.jet(inside, 4), alone.jet(inside, 4)
+        # The same function, of which the sums are rounded in another order.
+        assert (np.abs(found - same) <= 1e-14 * np.abs(same).max(axis=2, keepdims=True)).all()
         exact = Direct(TIMES[pair], JETS[pair], alpha, digits=80).jet(inside, 3)
         np.testing.assert_allclose(plan.jet(inside, 3)[:, 0], exact, rtol=0, atol=1e-12 * np.abs(exact).max())
 
