@@ -96,16 +96,18 @@ def _run_sampled(job: Job, form: SampledForm) -> Record:
 
 
 def _run_delayed(job: Job, form: DelayedForm) -> Record:
-    """Record of a linear continuous loop with delays."""
+    """Record of a linear loop with delays between continuous blocks."""
+    check_periods([job.blocks.blocks[i] for i in job.blocks.blocks_with("period")], job.first, float(job.times[-1]))
     given = job.prepared.time_signals(job.inputs, job.first)
     motion = DelayedMotion(form, given, job.first, float(job.times[-1]), job.state)
     watched = job.watched()
     times = with_event_times(job.times, watched, lambda: form.a)
+    times = np.union1d(times, motion.instants) if watched else times
 
     def snapshot(t: Array, x: Array) -> Snapshot:
         w = motion.at(t)[1]
-        signals = form.signals_z @ x + form.signals_w @ w
-        return Snapshot(t, x, w[: job.prepared.ninputs], form.read @ signals, lambda: signals)
+        signals = form.base.signals_z @ x + form.base.signals_w @ w
+        return Snapshot(t, x, w[: job.prepared.ninputs], form.base.read @ signals, lambda: signals)
 
     def interpolate(k: int, t: float) -> Array:
         return motion.at(np.array([t]))[0][:, 0]
