@@ -138,7 +138,7 @@ def _run(job: Job, form: LinearForm) -> Record:
 
     def states_at(t: Array, state: Array, a: Array = form.a) -> Array:
         found = None
-        if len(a) > _MANY_STATES or len(breakpoints) > _MANY_SEGMENTS:
+        if len(a) > _MANY_STATES or (len(a) and len(breakpoints) > _MANY_SEGMENTS):
             marks = np.unique(breakpoints)
             found = moment_states(a, form.b[:, ~sampled], partial(signal_values, planned), marks, t, state)
         if found is None:
