@@ -143,7 +143,9 @@ class DelayedMotion:
             if form.norm * cell > _REACH:
                 continue
             values = self._values(cell, edges, count)
-            if _resolved(values):
+            # Times are rounded: relative to the change of a signal over a cell by this much.
+            noise = _NOISE + 64.0 * np.finfo(float).eps * max(abs(self._first), abs(last)) / cell
+            if _resolved(values, noise):
                 return cell, edges, count, values
         text = ", ".join(f"{late.delay:g}" for late in form.lates)
         raise NotApplicableError(
@@ -283,14 +285,14 @@ def _integrals() -> tuple[Array, Array]:
     return series.chebvander(nodes, _NODES) @ coefficients, np.asarray(coefficients.sum(axis=0))
 
 
-def _resolved(values: Array) -> bool:
-    """Whether the functions of time are resolved by their values at the nodes."""
+def _resolved(values: Array, noise: float) -> bool:
+    """Whether the functions of time are resolved by their values at the nodes, to rounding errors of a given size."""
     found = np.abs(np.einsum("fj,kpfm->jkpm", transform(np.eye(_NODES)), values)).max(axis=(1, 2), initial=0.0)
     size = np.where(found.max(axis=0, initial=0.0) > 0.0, found.max(axis=0, initial=0.0), 1.0)
     last, middle = (found[part] / size for part in (slice(-2, None), slice(_NODES // 2, -2)))
     flat = last.max(axis=0, initial=0.0) > 0.1 * middle.max(axis=0, initial=0.0)
     small = last.max(axis=0, initial=0.0)
-    return bool(np.all((small <= _RESOLVED) | (flat & (small <= _NOISE))))
+    return bool(np.all((small <= _RESOLVED) | (flat & (small <= noise))))
 
 
 def _to_series(values: Array) -> Array:
