@@ -89,7 +89,7 @@ class LateSignal:
 
     def breakpoints_between(self, t0: float, t1: float) -> Array:
         """Start of the delayed signals, and their breakpoints after it."""
-        begin, end = max(t0 - self._late.delay, self._first), t1 - self._late.delay
+        begin, end = (max(t - self._late.delay, self._first) for t in (t0, t1))
         later = (t for signal in self._signals for t in signal.breakpoints_between(begin, end) if t > self._first)
         marks = np.unique([*self._marks, *later]) + self._late.delay
         return marks[slice(*np.searchsorted(marks, [t0, t1]).tolist())]

@@ -562,6 +562,19 @@ def test_a_sampled_law_whose_control_comes_late(method):
 
 
 @pytest.mark.parametrize("method", LINEAR)
+def test_a_sampled_jump_arrives_at_its_time(method):
+    """h = 1 from 0.01 s on comes 0.2 s later into an integrator, whatever the sample times of the response."""
+    held = cp.sample_hold(gain(1.0, "r", "h", "unit"), 0.3333, 0.01)
+    late = cp.create_delay_iosystem(0.2, inputs="h", outputs="w")
+    moved = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="w", outputs="x", name="moved")
+    loop = ct.interconnect([held, late, moved], inputs="r", outputs=["x", "w"])
+    times = np.array([0.0, 0.0952, 0.1, 0.22004, 0.2747])
+    found = cp.simulate(loop, times, 1.0, method=method, **TIGHT)
+    assert np.abs(found.outputs[0] - np.maximum(times - 0.21, 0.0)).max() <= 1e-10
+    assert found.outputs[1].tolist() == [0.0, 0.0, 0.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("method", LINEAR)
 def test_a_run_with_a_delay_that_stops(method):
     found = cp.simulate(
         integrators([1.0], [-1.0], 1.0),
