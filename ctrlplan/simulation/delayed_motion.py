@@ -1,10 +1,11 @@
-"""Exact states of a linear continuous loop with delays, by the method of steps with collocation.
+"""Exact states of a linear loop with delays between continuous blocks, by the method of steps with collocation.
 
 Time is divided into cells of a length that divides every delay: what a delay returns
 in a cell is what it stored in an earlier one, at the same nodes. Breakpoints of the
 functions of time, which return after each delay, divide every cell at the same
 places. The states at the nodes of a cell satisfy the integrated equations at these
-nodes, a linear system that is solved once for each part of a cell.
+nodes, a linear system that is solved once for each part of a cell. Discrete blocks
+are sampled at the starts of parts.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from numpy.polynomial import chebyshev as series
 from ctrlplan._types import Array
 from ctrlplan.simulation.built_forms import NotApplicableError
 from ctrlplan.simulation.exact import state_scale
+from ctrlplan.simulation.instants import instants_of
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.sampled_form import DelayedForm
-from ctrlplan.simulation.segments import as_fraction, time_tolerance
+from ctrlplan.simulation.segments import as_fraction, time_tolerance, values_after
 from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
 from ctrlplan.trajectories.chebyshev import points, transform
 
@@ -34,7 +36,7 @@ _NODES = 16
 _REACH = 2.0
 """Norm of the equations times the length of a cell up to which the nodes resolve the states."""
 
-_PARTS = 20_000
+_PARTS = 100_000
 """Maximum number of parts of cells of a run."""
 
 _RESOLVED, _NOISE = 1e-15, 1e-11
@@ -77,10 +79,15 @@ class DelayedMotion:
     state : ndarray, shape (n,)
         State at the start.
 
+    Attributes
+    ----------
+    instants : ndarray
+        Start of the run and sample times of the discrete blocks [s].
+
     Raises
     ------
     NotApplicableError
-        If the delays have no common divisor that is long enough.
+        If the delays and periods have no common divisor that is long enough.
     SolverError
         If a state overflows.
     """
@@ -94,6 +101,9 @@ class DelayedMotion:
         self._delayed, self._given = delayed, np.setdiff1d(np.arange(form.b.shape[1]), delayed)
         begins = np.cumsum([0, *(signal.width for signal in signals)]).tolist()
         self._signals = [s for s, begin in zip(signals, begins, strict=False) if begin not in set(delayed.tolist())]
+        timings = form.base.timings
+        found = instants_of(timings, first, last, self._tolerance)
+        self._due, self.instants = found.due, found.times
         self._cell, self._edges, count, values = self._divided(last)
         self._starts = np.add.outer(self._cell * np.arange(count), self._edges[:-1])
         self._run(values, state, last)
@@ -116,14 +126,15 @@ class DelayedMotion:
     def _divided(self, last: float) -> tuple[float, Array, int, Array]:
         """Length of a cell [s], edges of its parts, number of cells, and functions of time at all nodes."""
         form, span = self._form, last - self._first
-        delays = [as_fraction(late.delay) for late in form.lates]
-        den = math.lcm(*(delay.denominator for delay in delays))
-        common = Fraction(math.gcd(*(int(delay * den) for delay in delays)), den)
-        marks = np.array(breakpoints_of(self._signals, self._first, last))
-        marks = marks[(marks > self._first) & (marks < last)] - self._first
+        repeating = [as_fraction(late.delay) for late in form.lates] + [period for period, _ in form.base.timings]
+        den = math.lcm(*(time.denominator for time in repeating))
+        common = Fraction(math.gcd(*(int(time * den) for time in repeating)), den)
+        end = last + float(common)  # the run ends within the last cell
+        marks = np.array([t for t in breakpoints_of(self._signals, self._first, end) if self._first < t < end])
+        marks = np.append(marks - self._first, [float(offset) for _, offset in form.base.timings])
         for halving in range(_HALVINGS):
             cell = float(common / 2**halving)
-            count = max(1, math.ceil((span - self._tolerance) / cell))
+            count = math.floor((span + self._tolerance) / cell) + 1
             if count > _PARTS:
                 break
             edges = self._edges_of(marks, cell)
@@ -132,12 +143,14 @@ class DelayedMotion:
             if form.norm * cell > _REACH:
                 continue
             values = self._values(cell, edges, count)
-            if _resolved(values):
+            # Times are rounded: relative to the change of a signal over a cell by this much.
+            noise = _NOISE + 64.0 * np.finfo(float).eps * max(abs(self._first), abs(last)) / cell
+            if _resolved(values, noise):
                 return cell, edges, count, values
         text = ", ".join(f"{late.delay:g}" for late in form.lates)
         raise NotApplicableError(
-            f"delays of {text} s and the breakpoints of functions of time divide the run of {span:g} s into more than "
-            f"{_PARTS} parts"
+            f"delays of {text} s, sample times and breakpoints of functions of time divide the run of {span:g} s into "
+            f"more than {_PARTS} parts"
         )
 
     def _edges_of(self, marks: Array, cell: float) -> Array:
@@ -169,6 +182,7 @@ class DelayedMotion:
         given = values.reshape(count, nparts, _NODES * self._given.size)
         forced = np.stack([given[:, j] @ step[:, known:].T for j, step in enumerate(steps)], axis=1)
         maps = [np.ascontiguousarray(step[:, :known]) for step in steps]
+        jumps, left = self._jumps(), _start()
         with np.errstate(all="ignore"):
             for k in range(count):
                 for j in range(nparts):
@@ -177,6 +191,9 @@ class DelayedMotion:
                     back = own[n:].reshape(_NODES, width)
                     for hop, begin, end in zip(hops, ends[:-1], ends[1:], strict=True):
                         back[:, begin:end] = stored[k - hop, j, :, begin:end] if k >= hop else before[begin:end]
+                    jump = jumps.get(k * nparts + j)
+                    if jump is not None:
+                        own[:n] = jump[0] @ state + (jump[1] @ (left @ back) + jump[2])
                     after = maps[j].dot(own)
                     after += forced[k, j]
                     state = after[:n]
@@ -191,8 +208,21 @@ class DelayedMotion:
         if not (np.isfinite(states).all() and np.isfinite(stored).all()):
             bad = ~np.isfinite(states).all(axis=(1, 2, 3)) | ~np.isfinite(stored).all(axis=(1, 2, 3))
             at = self._first + self._cell * int(bad.argmax())
-            raise SolverError(f"states of {form.name} must stay finite up to {last:g} s, got an overflow at {at:g} s")
+            raise SolverError(
+                f"states of {form.base.name} must stay finite up to {last:g} s, got an overflow at {at:g} s"
+            )
         self._states, self._stored = _to_series(states), _to_series(stored)
+
+    def _jumps(self) -> dict[int, tuple[Array, Array, Array]]:
+        """Jumps at the starts of parts: matrices from states and delayed values, and a constant."""
+        form, found = self._form, dict[int, tuple[Array, Array, Array]]()
+        due = np.flatnonzero(self._due)
+        values = values_after(self._signals, self.instants[due], self._tolerance)
+        places = np.searchsorted(self._starts.ravel(), self.instants[due] - self._first + self._tolerance) - 1
+        for place, k, w in zip(places.tolist(), due.tolist(), values.T, strict=True):
+            jump, given = form.base.jump(int(self._due[k]))
+            found[place] = jump, given[:, self._delayed], given[:, self._given] @ w
+        return found
 
     def _part(self, length: float) -> _Part:
         """Maps of a part of a length [s]."""
@@ -242,6 +272,12 @@ class DelayedMotion:
 
 
 @lru_cache(maxsize=1)
+def _start() -> Array:
+    """Value of the interpolant at the start of a part, from those at its nodes."""
+    return np.where(np.arange(_NODES) % 2, -1.0, 1.0) @ transform(np.eye(_NODES)).T
+
+
+@lru_cache(maxsize=1)
 def _integrals() -> tuple[Array, Array]:
     """Integrals of the interpolant from the start of a part of unit length to its nodes, and over all of it."""
     coefficients = 0.5 * series.chebint(transform(np.eye(_NODES)).T, lbnd=-1.0, axis=0)
@@ -249,14 +285,14 @@ def _integrals() -> tuple[Array, Array]:
     return series.chebvander(nodes, _NODES) @ coefficients, np.asarray(coefficients.sum(axis=0))
 
 
-def _resolved(values: Array) -> bool:
-    """Whether the functions of time are resolved by their values at the nodes."""
+def _resolved(values: Array, noise: float) -> bool:
+    """Whether the functions of time are resolved by their values at the nodes, to rounding errors of a given size."""
     found = np.abs(np.einsum("fj,kpfm->jkpm", transform(np.eye(_NODES)), values)).max(axis=(1, 2), initial=0.0)
     size = np.where(found.max(axis=0, initial=0.0) > 0.0, found.max(axis=0, initial=0.0), 1.0)
     last, middle = (found[part] / size for part in (slice(-2, None), slice(_NODES // 2, -2)))
     flat = last.max(axis=0, initial=0.0) > 0.1 * middle.max(axis=0, initial=0.0)
     small = last.max(axis=0, initial=0.0)
-    return bool(np.all((small <= _RESOLVED) | (flat & (small <= _NOISE))))
+    return bool(np.all((small <= _RESOLVED) | (flat & (small <= noise))))
 
 
 def _to_series(values: Array) -> Array:

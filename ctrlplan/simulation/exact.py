@@ -123,7 +123,7 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     out = np.empty((timepts.size, scale.size))
     out[:1] = state
     steps: Array = np.diff(timepts)
-    even = _spacing(timepts - timepts[0], float(timepts[-1] - timepts[0]))
+    even = spacing(timepts - timepts[0], float(timepts[-1] - timepts[0]))
     if even:  # spacings that differ only by rounding share an exponential
         steps[:] = even
     terms = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms, in units of each interval
@@ -345,7 +345,7 @@ def taylor_cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[i
 
 def _samples_per_cell(samples: Array, duration: float, longest: float) -> int:
     """Number of evenly spaced samples per cell, a power of two; 0 if they are uneven or too few."""
-    step = _spacing(samples, duration) if samples.size >= 32 else 0.0
+    step = spacing(samples, duration) if samples.size >= 32 else 0.0
     if not step or max(samples[0], duration - samples[-1]) > step:
         return 0
     # Above the square root of the number of samples the table is more expensive than the propagation.
@@ -353,7 +353,7 @@ def _samples_per_cell(samples: Array, duration: float, longest: float) -> int:
     return 2 ** int(np.log2(maximum)) if maximum >= _CROSSOVER else 0
 
 
-def _spacing(samples: Array, duration: float) -> float:
+def spacing(samples: Array, duration: float) -> float:
     """Spacing of evenly spaced samples, up to rounding of times in the segment; 0 if they are uneven."""
     if samples.size < 2:
         return 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import control as ct
 import numpy as np
@@ -51,6 +52,11 @@ class LinearForm:
         found[np.isnan(found)] = np.inf
         return found
 
+    @cached_property
+    def poles(self) -> NDArray[np.inexact]:
+        """Poles of the loop."""
+        return np.asarray(np.linalg.eigvals(self.a))
+
     def sensitivity(self, duration: float) -> tuple[bool, bool, bool]:
         """Whether growth, fast poles or nonnormality amplify rounding errors above 1e-6 over a duration [s].
 
@@ -59,7 +65,7 @@ class LinearForm:
         """
         if not self.a.size:
             return False, False, False
-        poles = np.linalg.eigvals(self.a)
+        poles = self.poles
         growing, fast = duration * poles.real.max() > _GROWING, duration * np.abs(poles).max() > _FAST
         if growing or fast:
             return bool(growing), bool(fast), False

@@ -14,6 +14,9 @@ from ctrlplan._types import Array
 _PATTERN = 8
 """Minimum number of repetitions of a pattern of steps that are computed together."""
 
+_LARGE = 100
+"""Number of states above which single steps are as fast as blocks of equal ones."""
+
 _TRIED = 64
 """Maximum number of lengths of a pattern that are tried."""
 
@@ -37,6 +40,12 @@ def repeated(state: Array, change: Array, forced: Array | None, count: int) -> A
     together, then the state from block to block.
     """
     n = len(change)
+    if n > _LARGE and forced is not None:
+        found = np.empty((count, *state.shape))
+        for k in range(count):
+            state = state + (change @ state + forced[k])
+            found[k] = state
+        return found
     per = min(math.isqrt(count - 1) + 1, max(2, count // max(1, n)))  # powers must not cost more than the steps
     nblocks = -(-count // per)
     inner = np.zeros((nblocks, per, *state.shape))

@@ -250,91 +250,84 @@ def sampled_form(network: Network) -> SampledForm:
     ValueError
         If blocks form an algebraic loop without a solution.
     """
-    inner = [_inner(block) for block in network.blocks]
-    flow = _flow(network, inner)
-    n, ny = network.nstates, network.nsignals - network.ninputs
-    signals = np.concatenate([np.eye(network.ninputs, flow.b.shape[1]), flow.d[:ny]])
-    form = SampledForm(
-        network.name,
-        n,
-        network.moving,
-        flow.a[network.moving],
-        flow.b[network.moving],
-        np.concatenate([np.zeros((network.ninputs, n)), flow.c[:ny]]),
-        signals,
-        network.read,
-        tuple(_network_parts(network, inner, flow.c[ny:], flow.d[ny:])),
-        (),
-        np.zeros(0),
-    )
-    found = _Delays(network, form, flow.c[ny:], flow.d[ny:]).replaced()
+    found = _Delays(network, *_without_delays(network)).replaced()
     if len(found.timings) > _TIMINGS:
         raise NotLinearError(f"its blocks have more than {_TIMINGS} different periods and offsets")
     return found
 
 
+def _without_delays(network: Network) -> tuple[SampledForm, Array, Array]:
+    """Form with delayed signals as functions of time, and the inputs of all blocks from z and from w."""
+    inner = [_inner(block) for block in network.blocks]
+    flow = _flow(network, inner)
+    n, ny, moving = network.nstates, network.nsignals - network.ninputs, network.moving
+    form = SampledForm(
+        network.name,
+        n,
+        moving,
+        flow.a[moving],
+        flow.b[moving],
+        np.concatenate([np.zeros((network.ninputs, n)), flow.c[:ny]]),
+        np.concatenate([np.eye(network.ninputs, flow.b.shape[1]), flow.d[:ny]]),
+        network.read,
+        tuple(_network_parts(network, inner, flow.c[ny:], flow.d[ny:])),
+        (),
+        np.zeros(0),
+    )
+    return form, flow.c[ny:], flow.d[ny:]
+
+
 @dataclass(frozen=True, eq=False)
 class DelayedForm:
-    """Linear continuous loop with delays: x' = a x + b w; w: inputs, sources and delayed signals.
+    """Linear loop with delays between continuous blocks: x' = a x + b w; w: inputs, sources and delayed signals.
 
     Attributes
     ----------
-    name : str
-        Name of the loop.
+    base : SampledForm
+        The loop with delayed signals as functions of time.
     a, b : ndarray, shapes (n, n) and (n, nw)
-        The flow.
-    signals_z, signals_w : ndarray, shapes (nsignals, n) and (nsignals, nw)
-        All signals of the network.
-    read : ndarray, shape (noutputs, nsignals)
-        Outputs of the loop from its signals.
+        The flow of all states.
     lates : tuple of Late
         Delays; at least one.
     """
 
-    name: str
+    base: SampledForm
     a: Array
     b: Array
-    signals_z: Array
-    signals_w: Array
-    read: Array
     lates: tuple[Late, ...]
 
     @cached_property
     def norm(self) -> float:
         """Bound of the rate of the loop [1/s], with the gains of its delays."""
-        scale = state_scale(self.a)
-        total = np.abs(self.a) * (scale / scale[:, None])
+        moving = self.base.moving
+        inner, scale = self.a[np.ix_(moving, moving)], state_scale(self.a[np.ix_(moving, moving)])
+        total = np.abs(inner) * (scale / scale[:, None])
         for late in self.lates:
-            total = total + np.abs(self.b[:, late.columns]) @ np.abs(late.from_z) * (scale / scale[:, None])
+            gains = np.abs(self.b[moving][:, late.columns]) @ np.abs(late.from_z[:, moving])
+            total = total + gains * (scale / scale[:, None])
         return float(total.sum(axis=0).max(initial=0.0))
 
 
 def delayed_form(network: Network) -> DelayedForm:
-    """Form of a linear continuous network with delays.
+    """Form of a linear network with delays between continuous blocks.
 
     Raises
     ------
     NotLinearError
-        If a block is nonlinear or sampled; the message names it.
+        If a block is nonlinear; the message names it.
     ValueError
         If blocks form an algebraic loop without a solution.
     """
-    inner = [_inner(block) for block in network.blocks]
-    for block, own in zip(network.blocks, inner, strict=True):
-        if own is not None:
-            raise NotLinearError(f"block {block.name} is sampled, in a loop with a delay between continuous blocks")
-    flow = _flow(network, inner)
-    ny, n = network.nsignals - network.ninputs, network.nstates
+    base, from_z, from_w = _without_delays(network)
     columns, lates = dict(_time_columns(network)), []
     for i in network.blocks_with("delay"):
         block, rows = network.blocks[i], network.inputs[i]
-        width = rows.stop - rows.start
-        initial = np.broadcast_to(np.asarray(block.traits.initial, dtype=float), (width,))
-        from_z, from_w = flow.c[ny:][rows], flow.d[ny:][rows]
-        lates.append(Late(columns[i], float(block.delay or 0.0), initial, from_z, from_w, True, ()))
-    signals_z = np.concatenate([np.zeros((network.ninputs, n)), flow.c[:ny]])
-    signals_w = np.concatenate([np.eye(network.ninputs, flow.b.shape[1]), flow.d[:ny]])
-    return DelayedForm(network.name, flow.a, flow.b, signals_z, signals_w, network.read, tuple(lates))
+        initial = np.broadcast_to(np.asarray(block.traits.initial, dtype=float), (rows.stop - rows.start,))
+        lates.append(Late(columns[i], float(block.delay or 0.0), initial, from_z[rows], from_w[rows], True, ()))
+    n = base.nstates
+    a, b = np.zeros((n, n)), np.zeros((n, base.b.shape[1]))
+    a[base.moving], b[base.moving] = base.a, base.b
+    return DelayedForm(base, a, b, tuple(lates))
 
 
 def _inner(block: Block) -> LinearForm | None:

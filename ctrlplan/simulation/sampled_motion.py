@@ -89,7 +89,7 @@ class LateSignal:
 
     def breakpoints_between(self, t0: float, t1: float) -> Array:
         """Start of the delayed signals, and their breakpoints after it."""
-        begin, end = max(t0 - self._late.delay, self._first), t1 - self._late.delay
+        begin, end = (max(t - self._late.delay, self._first) for t in (t0, t1))
         later = (t for signal in self._signals for t in signal.breakpoints_between(begin, end) if t > self._first)
         marks = np.unique([*self._marks, *later]) + self._late.delay
         return marks[slice(*np.searchsorted(marks, [t0, t1]).tolist())]
@@ -538,10 +538,12 @@ def _resolved(spans: _Spans, fed: _Chosen) -> tuple[_Spans, Array]:
         used = np.flatnonzero(divided.lengths > divided.tolerance)
         some = used[np.unique(np.linspace(0, used.size - 1, min(_PROBES, used.size)).astype(int))]
         longest = used[np.argsort(-divided.lengths[used])[:_PROBES]]
-        orders = _orders(divided, fed, np.union1d(some, longest), _ORDERS)
-        for order in orders:
+        # Times are rounded: relative to the change of a signal over a span by this much.
+        largest = float(np.abs(divided.starts).max() / divided.lengths.max(initial=1e-300))
+        noise = _NOISE + 64.0 * np.finfo(float).eps * largest
+        for order, limit in _orders(divided, fed, np.union1d(some, longest), noise):
             values = fed.at(divided.starts[:, None] + divided.lengths[:, None] * gauss_nodes(order))
-            if _tail(values, order) <= _RESOLVED or order == orders[-1]:
+            if _tail(values, order) <= limit:
                 return divided, values
         if parts >= _PARTS:
             raise NotApplicableError("a function of time is not resolved between the sample times of the loop")
@@ -549,17 +551,15 @@ def _resolved(spans: _Spans, fed: _Chosen) -> tuple[_Spans, Array]:
         divided = spans.divided(parts)
 
 
-def _orders(spans: _Spans, fed: _Chosen, some: NDArray[np.intp], orders: Sequence[int]) -> list[int]:
-    """Numbers of nodes from the first that resolves the signals in some spans on; none if there is none."""
-    before = np.inf
-    for k, order in enumerate(orders):
-        tail = _tail(fed.at(spans.starts[some, None] + spans.lengths[some, None] * gauss_nodes(order)), order)
+def _orders(spans: _Spans, fed: _Chosen, some: NDArray[np.intp], noise: float) -> list[tuple[int, float]]:
+    """Numbers of nodes from the first that resolves the signals in some spans on, and limits of their tails."""
+    before, starts, lengths = np.inf, spans.starts[some, None], spans.lengths[some, None]
+    for k, order in enumerate(_ORDERS):
+        tail = _tail(fed.at(starts + lengths * gauss_nodes(order)), order)
         if tail <= _RESOLVED:
-            return list(orders[k:])
-        if (
-            before <= _NOISE and tail > before / _FALLING
-        ):  # rounding errors of the signals, which more nodes do not reduce
-            return [orders[k - 1]]
+            return [(p, _RESOLVED) for p in _ORDERS[k:]]
+        if before <= noise and tail > before / _FALLING:  # more nodes do not reduce rounding errors of the signals
+            return [(_ORDERS[k - 1], noise)]
         before = tail
     return []
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from bisect import bisect_right
+from bisect import bisect_right, insort
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -47,6 +47,9 @@ _TOLERANCE = 1e-12
 
 _DENOMINATOR = 10**7
 """Maximum denominator of times that are interpreted as fractions."""
+
+_JUMP = 1e-9
+"""Jump of an input of a delay, relative to its size, at whose arrival a segment ends."""
 
 _ROUNDINGS = 64.0
 """Rounding errors of a plan, in units of the last place of its largest values."""
@@ -234,6 +237,7 @@ def integrate(
         if not memory.record(left, right, series, grid, found):
             reach = 0.5 * (right - left)
             continue
+        schedule.add(memory.jumps)
         segments.append((left, series))
         requested = np.isin(grid, inside)
         known.append((np.append(left, grid[requested]), np.column_stack([x, found[:, requested]])))
@@ -346,6 +350,8 @@ class _Memory:
     ----------
     rounding : ndarray, shape (nsignals,)
         Rounding errors of all time signals: so far, of the delayed ones; otherwise 0.
+    jumps : list of float
+        Times [s] at which jumps at the start of the last stored segment arrive.
     """
 
     def __init__(self, network: Network, solver: Solver, time_signals: Sequence[TimeSignal], resolution: float) -> None:
@@ -362,6 +368,8 @@ class _Memory:
             if isinstance(signal, DelayedSignal)
         ]
         self.rounding: Array = np.zeros(sum(signal.width for signal in time_signals))
+        self._ends: list[Array | None] = [None for _ in self._time_signals]
+        self.jumps: list[float] = []
 
     def nodes(self, left: float, right: float) -> Array:
         """Times of a segment at which states are required."""
@@ -402,7 +410,15 @@ class _Memory:
                 return False
         for signal, piece, wire in zip(self._time_signals, pieces, self._wires, strict=True):
             signal.record(Series(left, right, piece, *_combined_bounds(wire, self._time_rows, series)))
+        self.jumps = [left + self.delays[k] for k, piece in enumerate(pieces) if self._has_jumped(k, piece)]
         return True
+
+    def _has_jumped(self, k: int, piece: Array) -> bool:
+        """Whether an input of a delay has jumped at the start of a segment, as the output of a sampled block does."""
+        before, start = self._ends[k], piece @ np.where(np.arange(piece.shape[1]) % 2, -1.0, 1.0)
+        self._ends[k] = piece.sum(axis=1)
+        size = np.abs(piece).sum(axis=1)
+        return before is not None and bool(np.any(np.abs(start - before) > _JUMP * np.maximum(size, np.abs(before))))
 
     def _values(self, times: Array, states: Array, time_values: Array) -> list[Array]:
         """Inputs (width, ntime) of each delay."""
@@ -429,7 +445,7 @@ class _Schedule:
     """
 
     def __init__(self, network: Network, time_signals: Sequence[TimeSignal], first: float, last: float) -> None:
-        self._time_signals = time_signals
+        self._time_signals, self._arrivals = time_signals, list[float]()
         self.prolong([], first, last)
         check_periods([network.blocks[i] for i in network.blocks_with("period")], first, last)
         self.samples = SampleTimes(network, first)
@@ -441,9 +457,15 @@ class _Schedule:
 
     def following(self, t: float) -> float:
         """The next time after t."""
-        due = self.fixed_after(t)
+        later = bisect_right(self._arrivals, t + self._tolerance)
+        due = min([self.fixed_after(t), *self._arrivals[later : later + 1]])
         sample = float(self.samples.next)
         return sample if sample <= min(due + self._tolerance, self._fixed[-1]) else due
+
+    def add(self, times: Sequence[float]) -> None:
+        """Add times at which jumps arrive."""
+        for t in times:
+            insort(self._arrivals, t)
 
     def fixed_after(self, t: float) -> float:
         """The next breakpoint after t, or the end."""

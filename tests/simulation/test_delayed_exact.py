@@ -125,5 +125,29 @@ def test_delays_without_a_common_part_run_by_another_method():
     loop = ct.interconnect([*blocks, moved], inputs=0, outputs="x")
     found = cp.simulate(loop, [0.0, 0.5, 1.0], None, 1.0)
     assert found.method in ("compiled", "python")
-    assert "delays of 1, 3.14159 s and the breakpoints of functions of time" in found.reason
+    assert "delays of 1, 3.14159 s, sample times and breakpoints of functions of time" in found.reason
     assert np.abs(found.outputs - [1.0, 0.0, -1.0]).max() <= 1e-7
+
+
+@pytest.mark.parametrize(("delay", "offset"), [(0.13, 0.0), (0.4, 0.03)])
+def test_a_sampled_control_of_a_loop_with_a_delay(delay, offset):
+    """x' = -2 x(t - delay) + h with h = r - x/2 every 0.1 s: powers of the time since each of many marks."""
+    late = cp.create_delay_iosystem(delay, inputs="x", outputs="w")
+    law = ct.ss([], [], [], [[1.0, -0.5]], 0.1, inputs=["r", "x"], outputs="h", name="law")
+    moved = ct.ss(0.0, [[-2.0, 1.0]], 1.0, 0.0, inputs=["w", "h"], outputs="x", name="moved")
+    loop = ct.interconnect([late, moved, cp.sample_hold(law, 0.1, offset)], inputs="r", outputs=["x", "h"])
+    found = cp.simulate(loop, 0.05 * np.arange(41), cp.Step(1.0, time=0.33), [0.5, 0.0])
+    with mp.workdps(50):
+        cell = mp.mpf("0.01")
+        hop, first, x, h, cells, rows = round(delay / 0.01), round(offset / 0.01), mp.mpf(0.5), mp.mpf(0), [], []
+        for k in range(201):
+            if k >= first and (k - first) % 10 == 0:
+                h = (1 if k >= 33 else 0) - x / 2
+            if k % 5 == 0:
+                rows.append([float(x), float(h)])
+            past = cells[k - hop] if k >= hop else [mp.mpf(0)] * (TERMS + 1)
+            own = [x, *((-2 * past[j] + (h if j == 0 else 0)) / (j + 1) for j in range(TERMS))]
+            cells.append(own)
+            x = sum(c * cell**j for j, c in enumerate(own))
+    assert (found.method, found.reason) == ("exact", "linear, with delays")
+    assert np.abs(found.outputs - np.array(rows).T).max() <= 1e-14

@@ -327,3 +327,16 @@ def test_an_unstable_loop_without_input_is_uncertain():
     loop = cp.sample_hold(memory, 0.1)
     with pytest.warns(UserWarning, match=r"outputs h of .* are uncertain by .* % of their size"):
         cp.simulate(loop, [0.0, 7.0], 1.1, [1.1, 0.0])
+
+
+def test_a_run_that_is_shorter_than_a_delay():
+    """The plan has not passed the delay of 5 s when the run ends; the integrator has moved by the initial value."""
+    plan, _ = plan_and_oracle()
+    late = cp.create_delay_iosystem(5.0, inputs="s", outputs="w", initial=2.0)
+    total = ct.ss([], [], [], [[1.0, 1.0]], inputs=["h", "r"], outputs="s", name="total", dt=None)
+    unit = cp.sample_hold(ct.ss([], [], [], [[1.0]], 0.1, inputs="r", outputs="h", name="unit"), 0.1)
+    moved = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="w", outputs="x", name="moved")
+    loop = ct.interconnect([late, total, unit, moved], inputs="r", outputs=["x", "w"])
+    found = cp.simulate(loop, [0.0, 0.4, 1.0], plan)
+    assert found.method == "exact"
+    assert np.abs(found.outputs - [[0.0, 0.8, 2.0], [2.0, 2.0, 2.0]]).max() <= 1e-15

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.exact import Jet, exact_states, sampled_states
 from ctrlplan.simulation.job import Job, Record, with_event_times
 from ctrlplan.simulation.linear import LinearForm
+from ctrlplan.simulation.moments import moment_states
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.sampled_form import DelayedForm, SampledForm
 from ctrlplan.simulation.sampled_motion import moved_signals
@@ -24,6 +26,9 @@ from ctrlplan.trajectories import Trajectory
 _UNCERTAIN = 1e-6
 """Uncertainty of an output, relative to its magnitude, above which it is reported."""
 
+
+_MANY_STATES, _MANY_SEGMENTS = 32, 16
+"""Numbers of states and of breakpoints above which the response is computed by moments of the plans."""
 
 _GROWTH = 1e6
 """Growth of a perturbation over a run of a loop with discrete blocks above which its uncertainty is determined."""
@@ -91,16 +96,18 @@ def _run_sampled(job: Job, form: SampledForm) -> Record:
 
 
 def _run_delayed(job: Job, form: DelayedForm) -> Record:
-    """Record of a linear continuous loop with delays."""
+    """Record of a linear loop with delays between continuous blocks."""
+    check_periods([job.blocks.blocks[i] for i in job.blocks.blocks_with("period")], job.first, float(job.times[-1]))
     given = job.prepared.time_signals(job.inputs, job.first)
     motion = DelayedMotion(form, given, job.first, float(job.times[-1]), job.state)
     watched = job.watched()
     times = with_event_times(job.times, watched, lambda: form.a)
+    times = np.union1d(times, motion.instants) if watched else times
 
     def snapshot(t: Array, x: Array) -> Snapshot:
         w = motion.at(t)[1]
-        signals = form.signals_z @ x + form.signals_w @ w
-        return Snapshot(t, x, w[: job.prepared.ninputs], form.read @ signals, lambda: signals)
+        signals = form.base.signals_z @ x + form.base.signals_w @ w
+        return Snapshot(t, x, w[: job.prepared.ninputs], form.base.read @ signals, lambda: signals)
 
     def interpolate(k: int, t: float) -> Array:
         return motion.at(np.array([t]))[0][:, 0]
@@ -110,7 +117,8 @@ def _run_delayed(job: Job, form: DelayedForm) -> Record:
 
 def _run(job: Job, form: LinearForm) -> Record:
     time_signals = [*job.inputs, *(PlanSignal(plan, high) for plan, high in form.sources)]
-    plans = [(signal.plan, signal.derivatives) for signal in time_signals if isinstance(signal, PlanSignal)]
+    planned = [signal for signal in time_signals if isinstance(signal, PlanSignal)]
+    plans = [(signal.plan, signal.derivatives) for signal in planned]
     sampled = (
         np.concatenate(
             [np.full(signal.width, isinstance(signal, SampledSignal)) for signal in time_signals] or [np.zeros(0)]
@@ -129,7 +137,12 @@ def _run(job: Job, form: LinearForm) -> Record:
         return Snapshot(t, x, values[: job.prepared.ninputs], form.outputs(x, values))
 
     def states_at(t: Array, state: Array, a: Array = form.a) -> Array:
-        found = exact_states(a, form.b[:, ~sampled], jet, breakpoints, t, state)
+        found = None
+        if len(a) > _MANY_STATES or (len(a) and len(breakpoints) > _MANY_SEGMENTS):
+            marks = np.unique(breakpoints)
+            found = moment_states(a, form.b[:, ~sampled], partial(signal_values, planned), marks, t, state)
+        if found is None:
+            found = exact_states(a, form.b[:, ~sampled], jet, breakpoints, t, state)
         if sampled.any():  # superposition of the responses to plans and to samples
             samples = signal_values(time_signals, t)[sampled]
             found = found + sampled_states(a, form.b[:, sampled], samples, t, np.zeros_like(state))

@@ -1,0 +1,70 @@
+"""Cost of exact responses with many states and segments compared with control.forced_response, in turn in one process.
+
+A chain of masses and springs, 10 s with 1001 samples, the force at its first mass along one polynomial, and along
+1000 segments. The peer connects the samples by straight lines.
+"""
+
+from statistics import median
+from time import process_time
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlplan as cp
+from ctrlplan.simulation.methods import exact
+
+T = np.linspace(0.0, 10.0, 1001)
+ROUNDS = 3
+
+
+def chain(masses):
+    springs = 2.0 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
+    a = np.block([[np.zeros((masses, masses)), np.eye(masses)], [-2.0 * springs, -0.3 * np.eye(masses)]])
+    return ct.ss(a, np.eye(2 * masses, 1, -masses), np.eye(1, 2 * masses), 0, inputs="r", outputs="y")
+
+
+def plan(segments):
+    points = [cp.Waypoint(10.0 * k / segments, float(np.sin(k)), 0, 0) for k in range(segments + 1)]
+    return cp.PiecewiseSpline(points, alpha=0.0, labels=["r"])
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("segments", [1, 1000])
+@pytest.mark.parametrize("states", [100, 200])
+def test_many_states_and_segments(states, segments, benchmark, capsys, monkeypatch):
+    system, move = chain(states // 2), plan(segments)
+    ready = cp.prepare(system)
+
+    def ours():
+        return cp.simulate(ready, T, move)
+
+    def peer():
+        return ct.forced_response(system, T, move(T))
+
+    found = benchmark.pedantic(ours, rounds=3, warmup_rounds=1)
+    rows = []
+    for _ in range(ROUNDS):
+        seconds = []
+        for function in (ours, peer):
+            begin = process_time()
+            function()
+            seconds.append(process_time() - begin)
+        rows.append(seconds)
+    own, other = (median(column) for column in zip(*rows, strict=True))
+    ratio = median(a / b for a, b in rows)
+    benchmark.extra_info["ratio"] = ratio
+    # By a series in each segment, over a tenth of the run, since that takes seconds.
+    some = T[:101]
+    monkeypatch.setattr(exact, "_MANY_STATES", 10**9)
+    monkeypatch.setattr(exact, "_MANY_SEGMENTS", 10**9)
+    begin = process_time()
+    slow = cp.simulate(ready, some, move)
+    before = process_time() - begin
+    error = np.abs(slow.outputs - found.outputs[:101]).max() / np.abs(slow.outputs).max()
+    assert error <= 1e-12
+    with capsys.disabled():
+        print(
+            f"\n{states} states, {segments} segments: {1e3 * own:.1f} ms, peer {1e3 * other:.1f} ms, ratio "
+            f"{ratio:.2f}; a tenth of it by segments {1e3 * before:.0f} ms, difference {error:.1e}"
+        )
