@@ -19,7 +19,7 @@ from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.durations import PlansByDuration, ReplannedPlans
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
-from ctrlplan.planning.path_law import FastLaw, Rates, fastest_law
+from ctrlplan.planning.path_law import FastLaw, Rates, fastest_law, fastest_smooth_law
 from ctrlplan.planning.path_law.positions import required_rate
 from ctrlplan.planning.path_law.vehicle import fastest_segment_law, orders_on_path
 from ctrlplan.planning.quantities import System, shapes_given, system_given
@@ -244,7 +244,7 @@ def fastest(
         shaped (`Shaper`), since another duration would change the delays. If limits
         of a loop are violated in its steady state. If `hold` is "path" and the plan
         jumps, limits are not local in time, or do not bound the speed; or if a
-        quantity or a derivative of order 3 or higher is limited and the plan is
+        quantity or a derivative of order 4 or higher is limited and the plan is
         closed and in motion at its ends.
     RuntimeError
         If a quantity is not resolved because it is noisy or oscillates.
@@ -283,7 +283,9 @@ def fastest(
     the duration is convex [1]_. Its cells are refined until the signals are on
     average within 0.5 % of a limit, so that the duration is at most about 0.3 %
     above the time-optimal one; the acceleration is continuous. No cell of the path
-    violates a limit.
+    violates a limit. With limits of jerks, b is a quartic spline, found by a sequence
+    of convex problems: a local minimum; the jerk is continuous between stops where
+    that of the path is.
 
     The states and inputs of a vehicle along a `PathPlan` are evaluated through the path
     parameter s. There a limited signal is c(s) + g(s) s', as the speed, the steering
@@ -291,7 +293,7 @@ def fastest(
     speed. Limits of the first kind bound b and those of the second one are linear in
     b, so that the time laws are the fastest ones up to the same 0.3 %.
 
-    With fixed path and other limits (derivatives of order 3 and higher, quantities)
+    With fixed path and other limits (derivatives of order 4 and higher, quantities)
     the rate is a spline with 16 knots in the time of the given plan, not along its
     path, and has four continuous derivatives. The duration then depends on the
     timing of that plan: for paths through 5 to 50 waypoints it was 1.4 (median) to 2
@@ -359,7 +361,8 @@ def fastest_under(
     if hold == "waypoints":
         return _searched(ReplannedPlans(plan, limited), span, hold, endless=False)
     if hold == "path":
-        if limited.derivatives_only and limited.order <= 2 and not isinstance(plan, PathPlan):
+        smooth = limited.derivatives_only and limited.order == 3 and ends == "free"
+        if (smooth or (limited.derivatives_only and limited.order <= 2)) and not isinstance(plan, PathPlan):
             return _fastest_on_path(plan, limited, span, ends)
         if ends != "free":
             raise ValueError(
@@ -457,10 +460,12 @@ def _fastest_in_loop(
 
 
 def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, float] | None, ends: Ends) -> Fastest:
-    """Plan of minimum duration on its path, under limits of velocities and accelerations."""
+    """Plan of minimum duration on its path, under limits of velocities, accelerations and jerks."""
     limited.check_constant('limits with hold="path"', over_time=True)
     for jump in plan.jumps(0):
         raise ValueError(f"plan must be continuous, got {jump.label} that jumps by {jump.size:.4g} at {jump.time:g} s")
+    if limited.order == 3:
+        limited.check_smooth(plan)
     _check_rest(plan, limited)
     _closed_form(plan, limited)  # raises for a direction in which no velocity is allowed
     on_path = limited if limited.is_constant else limited.at_positions()
@@ -506,10 +511,12 @@ def _with_given_ends(
 
 def _law_on_path(plan: Trajectory, limited: Limited, given: Rates = (None, None), reserve: float = 0.0) -> FastLaw:
     """Fast time law; positions in the path have full precision relative to its start."""
-    if not plan.start:
-        return fastest_law(plan, limited.bounds, plan.start, given, reserve)
-    found = fastest_law(plan.shift(-plan.start), limited.bounds, plan.start, given, reserve)
-    return replace(found, plan=found.plan.shift(plan.start))
+    begun = plan.shift(-plan.start) if plan.start else plan
+    if limited.order == 3:
+        found = fastest_smooth_law(begun, limited.bounds, plan.start)
+    else:
+        found = fastest_law(begun, limited.bounds, plan.start, given, reserve)
+    return replace(found, plan=found.plan.shift(plan.start)) if plan.start else found
 
 
 def _is_over_time(bound: Bound) -> bool:

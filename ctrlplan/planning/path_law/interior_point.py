@@ -7,10 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
 from ctrlplan.planning.path_law.grid import Spline
 from ctrlplan.trajectories.common import Array
+
+UNBOUNDED = (
+    "limits must bound the speed along the whole path, got a part of it that starts or ends in motion, without limits "
+    "of velocities; limit them"
+)
 
 _GAP = 1e-3
 """Duality gap relative to the duration."""
@@ -48,6 +53,10 @@ class Problem:
     rows: Array
     upper: Array
     lower: Array
+
+    def duration(self, x: Array) -> float:
+        """Duration [s] with given coefficients."""
+        return float((self.weights / np.sqrt(_applied(self.points, x[self.spline.index]))).sum())
 
     def feasible_scale(self, x: Array) -> float:
         """Largest factor of coefficients for which the inequalities hold."""
@@ -172,7 +181,10 @@ class _Search:
             terms[np.stack([fixed[i] | fixed[j] for i, j in self._pairs])] = 0.0
         bands = _summed(self._place, terms, (self._bandwidth + 1) * self._size).reshape(self._bandwidth + 1, self._size)
         bands[0] += np.where(self._fixed, 1.0, own)
-        factor = cholesky_banded(bands, lower=True, check_finite=False, overwrite_ab=True)
+        try:
+            factor = cholesky_banded(bands, lower=True, check_finite=False, overwrite_ab=True)
+        except LinAlgError:  # rates without bound
+            raise ValueError(UNBOUNDED) from None
         free = ~self._fixed
         return lambda right: free * cho_solve_banded((factor, True), free * right, check_finite=False)
 
