@@ -7,7 +7,8 @@ divided at its stops (`spans`) into cells (`grid`), limits are inequalities for 
 cell (`rows`), a feasible law is found by two passes (`sweep`), and the fastest one
 by an interior-point method (`interior_point`); cells that are not at a limit are
 divided (`law`). With limits of the jerk b is a quartic spline, and the problem a
-sequence of convex ones (`jerk`).
+sequence of convex ones (`jerk`); with limits of other signals it is a sequence of
+linearised ones (`signals`).
 """
 
 from ctrlplan.planning.path_law.jerk import fastest_smooth_law

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,6 +22,9 @@ _GAP = 1e-3
 """Duality gap relative to the duration."""
 
 _ROUNDS = 60
+
+_FAR = 1e6
+"""Largest ratio of a coefficient to that of the start without a trust region."""
 
 _NEAREST = 0.02
 """Minimum of the slacks at the start, relative to the limits."""
@@ -44,7 +48,9 @@ class Problem:
     rows : ndarray, shape (size, nrows, ncells)
         Rows of the inequalities, by the coefficients of a cell.
     upper, lower : ndarray, shape (nrows, ncells), (ntwo, ncells)
-        Limits, upper ones above 0; lower ones, below 0, of the first rows.
+        Limits; lower ones of the first rows.
+    trust : float, optional
+        Largest ratio of a coefficient to that of the start, and of its reciprocal.
     """
 
     spline: Spline
@@ -53,6 +59,7 @@ class Problem:
     rows: Array
     upper: Array
     lower: Array
+    trust: float = math.inf
 
     def duration(self, x: Array) -> float:
         """Duration [s] with given coefficients."""
@@ -94,6 +101,7 @@ class _Search:
         spline = problem.spline
         self._index, self._size, self._bandwidth = spline.index, spline.size, spline.bandwidth
         self._fixed, self._scale = spline.fixed, np.where(spline.fixed, 1.0, start)
+        self._floor, self._ceiling = 1.0 / problem.trust, min(problem.trust, _FAR)
         self._start = np.where(spline.fixed, start, 1.0)
         own = self._scale[spline.index]
         self._points, self._weights = problem.points * own[:, None], problem.weights
@@ -106,7 +114,8 @@ class _Search:
         """Coefficients at the optimum."""
         x = self._start
         w = np.maximum(self._slacks(x), _NEAREST)
-        active: Array = np.append(np.ones(w.size - x.size), np.where(self._fixed, 0.0, 1.0))
+        free = np.where(self._fixed, 0.0, 1.0)
+        active: Array = np.concatenate([np.ones(w.size - 2 * x.size), free, free])
         # At the optimum the sum of the multipliers of normalised limits is half the duration.
         y = active * 0.5 * self._duration(x) / (active / w).sum() / w
         for _ in range(_ROUNDS):
@@ -146,19 +155,21 @@ class _Search:
         """Distances from all limits; 1 for a prescribed coefficient."""
         values = _applied(self._rows, x[self._index])
         below = values[: len(self._lower)] - self._lower
-        return np.concatenate([(self._upper - values).ravel(), below.ravel(), np.where(self._fixed, 1.0, x)])
+        ends = (np.where(self._fixed, 1.0, own) for own in (x - self._floor, self._ceiling - x))
+        return np.concatenate([(self._upper - values).ravel(), below.ravel(), *ends])
 
     def _changes(self, dx: Array) -> Array:
         """Changes of the slacks with coefficients."""
         values = _applied(self._rows, dx[self._index])
-        return np.concatenate([-values.ravel(), values[: len(self._lower)].ravel(), dx])
+        return np.concatenate([-values.ravel(), values[: len(self._lower)].ravel(), dx, -dx])
 
     def _by_row(self, values: Array, sign: float) -> tuple[Array, Array]:
         """Values of the slacks of both limits of each row, with a sign of the upper one; those of coefficients."""
         count, two = self._upper.size, self._lower.size
         rows = sign * values[:count].reshape(self._upper.shape)
         rows[: len(self._lower)] += values[count : count + two].reshape(self._lower.shape)
-        return rows, values[count + two :]
+        low, high = values[count + two :].reshape(2, -1)
+        return rows, low + sign * high
 
     def _pulled(self, values: Array) -> Array:
         """Transposed changes of the slacks."""

@@ -22,7 +22,7 @@ from ctrlplan.planning.path_law.law import FastLaw, changes, losses, problem_of
 from ctrlplan.planning.path_law.rows import SMOOTH_POINTS, Activity
 from ctrlplan.planning.path_law.spans import Part, parts_of
 from ctrlplan.trajectories import PiecewisePolynomial, Retimed, Trajectory
-from ctrlplan.trajectories.common import Array, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 
 _ROUNDS, _GAIN = 25, 1e-3
 """Maximum number of problems on a grid, and the decrease of the duration, relative to it, that ends them."""
@@ -61,10 +61,10 @@ def fastest_smooth_law(plan: Trajectory, bounds: Sequence[Bound], start: float) 
         if loss.sum() < _LOSS or refinement == _REFINEMENTS:
             break
         counts = np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int)
-        local, grid = _on_pieces(local, counts), grid.divided(counts)
+        local, grid = on_pieces(local, counts), grid.divided(counts)
         spline, activity = Spline.quartic(grid), Activity.of(grid, bounds, SMOOTH_POINTS, start)
         x = spline.near(local)
-    return FastLaw(Retimed(plan, _law(plan, parts, grid, local)), ())
+    return FastLaw(Retimed(plan, smooth_law(plan, parts, grid, local)), ())
 
 
 def _constant(grid: Grid, activity: Activity) -> float:
@@ -90,7 +90,7 @@ def _converged(grid: Grid, spline: Spline, activity: Activity, x: Array) -> Arra
     return spline.coefficients(x)
 
 
-def _on_pieces(local: Array, counts: NDArray[np.intp]) -> Array:
+def on_pieces(local: Array, counts: NDArray[np.intp]) -> Array:
     """Bernstein coefficients on the pieces of divided cells."""
     degree = len(local) - 1
     points = np.linspace(0.0, 1.0, degree + 1)
@@ -105,8 +105,8 @@ def _on_pieces(local: Array, counts: NDArray[np.intp]) -> Array:
     return own
 
 
-def _law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array) -> PiecewisePolynomial:
-    """Time law of degree 7 with rates, accelerations and jerks of the squared rate at the ends of cells."""
+def smooth_law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array) -> PiecewisePolynomial:
+    """Time law of degree 9 with the rate and three of its derivatives, from the squared rate, at the ends of cells."""
     dwells = [span for part in parts if not part.moves for span in part.spans]
     places = np.append(
         plan.breakpoints[grid.segment] + grid.start, [plan.breakpoints[s.segment] + s.start for s in dwells]
@@ -117,9 +117,9 @@ def _law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array) -> P
     places, lengths, table = places[order], lengths[order], table[:, order]
     degree = len(table) - 1
     durations = lengths * (_WEIGHTS @ (1.0 / np.sqrt(bernstein(_NODES, degree) @ table)))
-    b, slope, bend = (bernstein(_ENDS, degree, nu) @ table / lengths**nu for nu in range(3))
+    b, slope, bend, third = (bernstein(_ENDS, degree, nu) @ table / lengths**nu for nu in range(4))
     rate = np.sqrt(b)
-    ends = np.stack([np.zeros_like(rate), rate, 0.5 * slope, 0.5 * bend * rate])
+    ends = np.stack([np.zeros_like(rate), rate, 0.5 * slope, 0.5 * bend * rate, 0.5 * third * b + 0.25 * bend * slope])
     ends[0, 1] = lengths
     coefficients = _hermite(ends, durations)
     coefficients[-1] = places
@@ -128,13 +128,14 @@ def _law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array) -> P
 
 
 def _hermite(ends: Array, durations: Array) -> Array:
-    """Coefficients (8, ncells), highest power first, by derivatives (4, 2, ncells) at both ends of each cell."""
-    factorials = np.array([1.0, 1.0, 2.0, 6.0])
-    scaled = ends * durations ** np.arange(4)[:, None, None] / factorials[:, None, None]
+    """Coefficients (2 n, ncells), highest power first, by n derivatives (n, 2, ncells) at both ends of each cell."""
+    count = len(ends)
+    factorials = FACTORIALS[:count]
+    scaled = ends * durations ** np.arange(count)[:, None, None] / factorials[:, None, None]
     low, high = scaled[:, 0], scaled[:, 1]
     binomials = np.array(
-        [[np.prod(np.arange(k - nu + 1, k + 1)) / factorials[nu] for k in range(8)] for nu in range(4)]
+        [[np.prod(np.arange(k - nu + 1, k + 1)) / factorials[nu] for k in range(2 * count)] for nu in range(count)]
     )
-    rest = high - binomials[:, :4] @ low
-    powers = np.concatenate([low, np.linalg.solve(binomials[:, 4:], rest)])
-    return (powers / durations ** np.arange(8)[:, None])[::-1].copy()
+    rest = high - binomials[:, :count] @ low
+    powers = np.concatenate([low, np.linalg.solve(binomials[:, count:], rest)])
+    return (powers / durations ** np.arange(2 * count)[:, None])[::-1].copy()
