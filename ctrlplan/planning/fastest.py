@@ -473,6 +473,14 @@ def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, floa
         raise ValueError(f"plan must be continuous, got {jump.label} that jumps by {jump.size:.4g} at {jump.time:g} s")
     if limited.order == 3:
         limited.check_smooth(plan)
+    if not limited.order:
+        raise ValueError("limits must include one that a shorter plan would violate, got none")
+    for bound in limited.bounds:
+        if bound.order > 1 and 0.0 in (bound.low, bound.high):
+            raise ValueError(
+                f'limits of {bound.name} must allow both signs with hold="path", got {bound.range}; give a small limit '
+                'instead of 0, or use hold="shape"'
+            )
     _check_rest(plan, limited)
     _closed_form(plan, limited)  # raises for a direction in which no velocity is allowed
     on_path = limited if limited.is_constant else limited.at_positions()

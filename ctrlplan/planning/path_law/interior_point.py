@@ -14,8 +14,8 @@ from ctrlplan.planning.path_law.grid import Spline
 from ctrlplan.trajectories.common import Array
 
 UNBOUNDED = (
-    "limits must bound the speed along the whole path, got a part of it that starts or ends in motion, without limits "
-    "of velocities; limit them"
+    "limits must bound the speed along the whole path, got a part of it where they do not and the plan does not come "
+    "to rest; limit the velocities there"
 )
 
 _GAP = 1e-3

@@ -13,7 +13,7 @@ from ctrlplan.trajectories.common import Array
 _ROUNDS = 4
 """Rounds over a closed part, until its end is consistent with its start."""
 
-_FAR = 1e30
+_FAR = 1e100
 """Squared rate without a limit."""
 
 
