@@ -67,6 +67,11 @@ _RESERVES = (1e-4, 3e-4, 1e-3, 3e-3)
 _AT_ENDS = 1e-12
 """Excess that is the rounding of a given speed at a limit."""
 
+_STEPS, _NEAR = 6, 1e-9
+"""Number of evaluations of a plan near its limits, and margin of the active limit that ends them."""
+
+_LOCAL = "not searched; a local minimum of the time law"
+
 Ends = Literal["free", "given"]
 """Speeds at the ends of a plan with another time law."""
 
@@ -87,7 +92,8 @@ class Fastest(Displayed):
     feasible : tuple of (float, float)
         Intervals of feasible durations [s], increasing. The last end is inf if
         every longer duration is feasible, otherwise the end of the search. With
-        `statement` only the minimum duration.
+        `statement`, as for limits of quantities with fixed path, only the minimum
+        duration.
     hold : str
         Property that was preserved: "shape", "waypoints" or "path".
     limited : Limited
@@ -98,8 +104,8 @@ class Fastest(Displayed):
     searched : (float, float)
         Interval of durations [s] of the search.
     statement : str
-        What is known of shorter durations, for limits on signals of a loop;
-        otherwise empty.
+        What is known of shorter durations, for limits on signals of a loop, and of
+        quantities with fixed path; otherwise empty.
     stops : tuple of float
         With hold="path": times [s] of the given plan at which its path has corners,
         where the plan stops.
@@ -385,7 +391,8 @@ def fastest_under(
     if limited.order > HIGHEST:
         retimed = fastest_within(with_fast_time_law(begun, limited).shift(plan.start), limited, span)
     else:
-        retimed = fastest_within(fast_law_of_signals(begun, limited).shift(plan.start), limited, span)
+        law = fast_law_of_signals(begun, limited).shift(plan.start)
+        retimed = (_at_its_limit(law, limited) if span is None else None) or fastest_within(law, limited, span)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
 
 
@@ -536,6 +543,31 @@ def _law_on_path(plan: Trajectory, limited: Limited, given: Rates = (None, None)
 
 def _is_over_time(bound: Bound) -> bool:
     return not bound.is_constant and bound.order > 0
+
+
+def _at_its_limit(plan: Trajectory, limited: Limited) -> Fastest | None:
+    """Plan of fixed shape near a duration at which its active limit is attained; None if it is not found at once.
+
+    The duration is that at which the signal at the time of its extremum attains the limit.
+    """
+    for _ in range(_STEPS):
+        margins = limited.margins(plan)
+        active = margins.active
+        if 0.0 <= active.fraction <= _NEAR:
+            return Fastest(plan, margins, ((plan.duration, plan.duration),), "path", limited, statement=_LOCAL)
+        row = next(k for k, bound in enumerate(limited.bounds) if active.of(bound))
+        jet = np.stack([plan.jet(active.time, limited.order, left=left) for left in (True, False)], axis=-1)
+        powers = -np.arange(float(len(jet)))[:, None, None]
+
+        def excess(factor: float, jet: Array = jet, powers: Array = powers, row: int = row) -> float:
+            return float(limited.bounds[row].excess(limited.values(jet * factor**powers)[row]).max())
+
+        try:
+            factor = float(brentq(excess, 0.97, 1.1, xtol=1e-15))
+        except ValueError:  # the signal has no such duration nearby, or is infeasible for the plant
+            return None
+        plan = plan.retime(plan.duration * factor * (1.0 + 0.1 * _NEAR))
+    return None
 
 
 def _check_open(plan: Trajectory) -> None:
