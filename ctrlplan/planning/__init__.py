@@ -26,7 +26,7 @@ Limits are satisfied over the whole interval, not only at samples. In the order 
     ``HalfPlane((0, -1), -2.0)`` keeps the load below z = 2.
 
 Limits on derivatives have a closed-form solution. For a crane `fastest` takes
-about a tenth of a second (one or two seconds with ``hold="path"``),
+about a tenth of a second (one second with ``hold="path"``),
 `choose_alpha` 40 ms.
 
 Examples

@@ -16,6 +16,9 @@ from ctrlplan.trajectories.files import trajectory_from_dict
 from ctrlplan.trajectories.time_law import TimeLaw
 from ctrlplan.trajectories.trajectory import Trajectory, check_end
 
+_MANY = 16
+"""Number of segments above which they are evaluated together."""
+
 _ROUNDING = 1e-12
 """Relative rounding error allowed in times and rates."""
 
@@ -70,6 +73,8 @@ class Retimed(Trajectory):
                 raise TypeError(f"{name} must be a Trajectory, got {type(value).__name__}")
         names = checked_labels(plan.labels if labels is None else labels, plan.naxes)
         slack = _ROUNDING * max(abs(plan.start), abs(plan.end))
+        # Times of the law are rounded, by more than those of the plan if it starts late.
+        slack += 16.0 * float(np.spacing(max(abs(law.start), abs(law.end)))) * plan.duration / (law.duration or 1.0)
         values = _checked_law(plan, law, slack)
         passed = np.array([_passing(law, values, float(b), slack) for b in plan.breakpoints[1:-1]])
         breakpoints = np.union1d(law.breakpoints, passed)
@@ -115,8 +120,8 @@ class Retimed(Trajectory):
 
     @property
     def in_batches(self) -> bool:
-        """Whether segments are evaluated together, as those of the law are."""
-        return self.law.in_batches
+        """Whether segments are evaluated together: many, or those of a law that are."""
+        return self.law.in_batches or self.breakpoints.size > _MANY
 
     def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
         """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""

@@ -82,3 +82,28 @@ def test_fastest_on_a_path(benchmark, capsys, count, naxes):
             f"\n{count} waypoints, {naxes} axes: {own:.1f} ms, toppra {theirs:.1f} ms, ratio {ratio:.2f}; "
             f"duration {found.duration:.4f} s, toppra {other:.4f} s, ratio {found.duration / other:.4f}"
         )
+
+
+@pytest.mark.benchmark(group="path law")
+@pytest.mark.parametrize("count", [5, 50])
+def test_fastest_on_a_path_with_limited_jerk(benchmark, capsys, count):
+    """No peer is installed that limits the jerk on a path: the ratio is that to the same without this limit."""
+    plan, limits = random_path(count, 3), LIMITS | {"jerk": 20.0}
+    found, without = (cp.fastest(plan, own, hold="path") for own in (limits, LIMITS))
+    assert found.margins.satisfied
+    times = []
+    for _ in range(3):
+        seconds = []
+        for own in (limits, LIMITS):
+            begin = process_time()
+            cp.fastest(plan, own, hold="path")
+            seconds.append(process_time() - begin)
+        times.append(seconds)
+    benchmark.pedantic(lambda: cp.fastest(plan, limits, hold="path"), rounds=1)
+    own, other = (1e3 * median(column) for column in zip(*times, strict=True))
+    benchmark.extra_info["ratio"] = own / other
+    with capsys.disabled():
+        print(
+            f"\n{count} waypoints, jerk: {own:.0f} ms, without {other:.0f} ms, ratio {own / other:.2f}; "
+            f"duration {found.duration:.4f} s, without {without.duration:.4f} s"
+        )

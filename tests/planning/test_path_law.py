@@ -232,6 +232,28 @@ def test_limits_that_do_not_bound_the_speed_are_rejected():
         fastest(plan, {"acceleration": 1.0}, hold="path")
 
 
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"y": (-1.0, 2.0)}, "limits must include one that a shorter plan would violate, got none"),
+        ({"y_d1": cp.Limits(-1.0, 1.0, during=(0.3, 0.4))}, "limits must bound the speed along the whole path"),
+        ({"y_d1": 1.0, "y_d2": (0.0, 1.0)}, 'limits of y_d2 must allow both signs with hold="path", got from 0 to 1'),
+        ({"velocity": 0.0}, "limits of velocity must be finite and above 0"),
+        ({"acceleration": np.nan}, "limits of acceleration must be finite and above 0"),
+        ({"y_d1": (2.0, -2.0)}, "limits of y_d1 must increase, got 2 and -2"),
+    ],
+)
+def test_limits_that_are_rejected(limits, message):
+    with pytest.raises(ValueError, match=message):
+        fastest(MOVE, limits, hold="path")
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e12])
+def test_extreme_limits(size):
+    found = fastest(MOVE, {"velocity": 10.0 * size, "acceleration": 100.0 * size**2}, hold="path")
+    assert 0.2 / size <= found.duration <= 0.2 / size * 1.003
+
+
 # Closed paths and start times
 
 CYCLE = TrigSpline.cyclic([Waypoint(0, [0, 0]), Waypoint(1, [3, 0]), Waypoint(2, [1, 2])], 3.0)

@@ -6,10 +6,13 @@ and the duration, the integral of 1/sqrt(b), is convex. b is a quadratic spline.
 divided at its stops (`spans`) into cells (`grid`), limits are inequalities for each
 cell (`rows`), a feasible law is found by two passes (`sweep`), and the fastest one
 by an interior-point method (`interior_point`); cells that are not at a limit are
-divided (`law`).
+divided (`law`). With limits of the jerk b is a quartic spline, and the problem a
+sequence of convex ones (`jerk`); with limits of other signals it is a sequence of
+linearised ones (`signals`).
 """
 
+from ctrlplan.planning.path_law.jerk import fastest_smooth_law
 from ctrlplan.planning.path_law.law import FastLaw, fastest_law
 from ctrlplan.planning.path_law.spans import Rates
 
-__all__ = ["FastLaw", "Rates", "fastest_law"]
+__all__ = ["FastLaw", "Rates", "fastest_law", "fastest_smooth_law"]

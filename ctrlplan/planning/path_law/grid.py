@@ -9,6 +9,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.spans import Part
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array, readonly
@@ -97,11 +98,11 @@ class Grid:
         chosen = np.array([[rate is not None and (rate > 0.0) == moving for rate in part.rates] for part in self.parts])
         return first[chosen[:, 0]], last[chosen[:, 1]]
 
-    def jets(self, fractions: Array) -> Array:
-        """Derivatives 1 and 2 of the plan (2, naxes, npoints, ncells) at points of each cell."""
+    def jets(self, fractions: Array, order: int) -> Array:
+        """Derivatives 1 to an order of the plan (order, naxes, npoints, ncells) at points of each cell."""
         times = self.start[:, None] + self.length[:, None] * fractions
-        found = self.plan.segments_jet(np.repeat(self.segment, fractions.size), times.ravel(), 2)[1:]
-        return found.reshape(2, self.plan.naxes, self.start.size, fractions.size).transpose(0, 1, 3, 2)
+        found = self.plan.segments_jet(np.repeat(self.segment, fractions.size), times.ravel(), order)[1:]
+        return found.reshape(order, self.plan.naxes, self.start.size, fractions.size).transpose(0, 1, 3, 2)
 
     def times(self, fractions: Array) -> Array:
         """Times of the plan [s] (npoints, ncells)."""
@@ -141,9 +142,9 @@ class Spline:
 
     Attributes
     ----------
-    index : ndarray of int, shape (3, ncells)
+    index : ndarray of int, shape (degree + 1, ncells)
         Coefficients of each cell.
-    bernstein : ndarray, shape (3, 3, ncells)
+    bernstein : ndarray, shape (degree + 1, degree + 1, ncells)
         Bernstein coefficients of a cell (first axis) by these coefficients.
     size, bandwidth : int
         Number of coefficients, and bandwidth of their normal equations.
@@ -158,8 +159,28 @@ class Spline:
     fixed: NDArray[np.bool_]
 
     @classmethod
+    def quartic(cls, grid: Grid) -> Spline:
+        """Spline with three continuous derivatives in each part, by the coefficients of B-splines."""
+        index, extraction = np.empty((5, grid.length.size), dtype=np.intp), np.empty((5, 5, grid.length.size))
+        size, bandwidth = 0, 4
+        firsts = np.flatnonzero(np.diff(grid.part, prepend=-1)).tolist()
+        for part, begin, end in zip(grid.parts, firsts, [*firsts[1:], grid.length.size], strict=True):
+            cells, count, own = np.arange(end - begin), end - begin, slice(begin, end)
+            steps = grid.length[own]
+            beyond = np.resize(steps, 4) if part.closed else np.zeros(4)
+            before = np.resize(steps[::-1], 4)[::-1] if part.closed else np.zeros(4)
+            knots = np.cumsum(np.concatenate([[0.0], before, steps, beyond])) - before.sum()
+            extraction[:, :, own] = _extraction(knots, 4)
+            index[:, own] = cells + np.arange(5)[:, None]
+            if part.closed:
+                index[:, own], bandwidth = _interleaved(count)[(index[:, own] - 2) % count], 8
+            index[:, own] += size
+            size += count if part.closed else count + 4
+        return cls(index, extraction, size, bandwidth, np.zeros(size, dtype=bool))
+
+    @classmethod
     def of(cls, grid: Grid) -> Spline:
-        """Spline on a grid."""
+        """Quadratic spline with a continuous derivative in each part."""
         h, ratios, bends = grid.length, *grid.joints
         index, extraction = np.empty((3, h.size), dtype=np.intp), np.zeros((3, 3, h.size))
         extraction[1, 1] = 1.0
@@ -186,12 +207,37 @@ class Spline:
         return cls(index, extraction, size, bandwidth, np.array(fixed))
 
     def coefficients(self, x: Array) -> Array:
-        """Bernstein coefficients (3, ncells) of each cell."""
+        """Bernstein coefficients (degree + 1, ncells) of each cell."""
         return np.einsum("bmc,mc->bc", self.bernstein, x[self.index])
 
+    def near(self, local: Array) -> Array:
+        """Coefficients of a spline near given Bernstein coefficients: least squares in each cell, and their means."""
+        own = np.linalg.solve(self.bernstein.transpose(2, 0, 1), local.T[:, :, None])[:, :, 0].T
+        counts = np.bincount(self.index.ravel(), minlength=self.size)
+        return np.bincount(self.index.ravel(), own.ravel(), self.size) / counts
+
     def rows(self, local: Array) -> Array:
-        """Rows (3, nrows, ncells) of the spline, from those (nrows, ncells, 3) for Bernstein coefficients."""
+        """Rows (size, nrows, ncells) of the spline, from those (nrows, ncells, size) for Bernstein coefficients."""
         return np.einsum("rcb,bmc->mrc", local, self.bernstein)
+
+
+def _extraction(knots: Array, degree: int) -> Array:
+    """Bernstein coefficients (degree + 1, degree + 1, ncells) of the B-splines on each cell, in this order of axes."""
+    cells = np.arange(degree, knots.size - degree - 1)
+    points = np.linspace(0.0, 1.0, degree + 1)
+    x = knots[cells] + points[:, None] * (knots[cells + 1] - knots[cells])
+    values = np.zeros((degree + 1, degree + 1, cells.size))  # by B-spline and point
+    values[0] = 1.0
+    for order in range(1, degree + 1):  # the recursion of Cox and de Boor, of all cells together
+        carried = np.zeros_like(x)
+        for k in range(order):
+            left, right = knots[cells + k + 1 - order], knots[cells + k + 1]
+            share = values[k] / (right - left)
+            values[k] = carried + (right - x) * share
+            carried = (x - left) * share
+        values[order] = carried
+    own: Array = np.einsum("bp,mpc->bmc", np.linalg.inv(bernstein(points, degree)), values)
+    return own
 
 
 def _interleaved(count: int) -> NDArray[np.intp]:

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
 from ctrlplan.planning.path_law.grid import Spline
 from ctrlplan.trajectories.common import Array
+
+UNBOUNDED = (
+    "limits must bound the speed along the whole path, got a part of it where they do not and the plan does not come "
+    "to rest; limit the velocities there"
+)
 
 _GAP = 1e-3
 """Duality gap relative to the duration."""
 
 _ROUNDS = 60
+
+_FAR = 1e6
+"""Largest ratio of a coefficient to that of the start without a trust region."""
 
 _NEAREST = 0.02
 """Minimum of the slacks at the start, relative to the limits."""
@@ -39,7 +48,9 @@ class Problem:
     rows : ndarray, shape (size, nrows, ncells)
         Rows of the inequalities, by the coefficients of a cell.
     upper, lower : ndarray, shape (nrows, ncells), (ntwo, ncells)
-        Limits, upper ones above 0; lower ones, below 0, of the first rows.
+        Limits; lower ones of the first rows.
+    trust : float, optional
+        Largest ratio of a coefficient to that of the start, and of its reciprocal.
     """
 
     spline: Spline
@@ -48,6 +59,11 @@ class Problem:
     rows: Array
     upper: Array
     lower: Array
+    trust: float = math.inf
+
+    def duration(self, x: Array) -> float:
+        """Duration [s] with given coefficients."""
+        return float((self.weights / np.sqrt(_applied(self.points, x[self.spline.index]))).sum())
 
     def feasible_scale(self, x: Array) -> float:
         """Largest factor of coefficients for which the inequalities hold."""
@@ -85,6 +101,7 @@ class _Search:
         spline = problem.spline
         self._index, self._size, self._bandwidth = spline.index, spline.size, spline.bandwidth
         self._fixed, self._scale = spline.fixed, np.where(spline.fixed, 1.0, start)
+        self._floor, self._ceiling = 1.0 / problem.trust, min(problem.trust, _FAR)
         self._start = np.where(spline.fixed, start, 1.0)
         own = self._scale[spline.index]
         self._points, self._weights = problem.points * own[:, None], problem.weights
@@ -97,7 +114,8 @@ class _Search:
         """Coefficients at the optimum."""
         x = self._start
         w = np.maximum(self._slacks(x), _NEAREST)
-        active: Array = np.append(np.ones(w.size - x.size), np.where(self._fixed, 0.0, 1.0))
+        free = np.where(self._fixed, 0.0, 1.0)
+        active: Array = np.concatenate([np.ones(w.size - 2 * x.size), free, free])
         # At the optimum the sum of the multipliers of normalised limits is half the duration.
         y = active * 0.5 * self._duration(x) / (active / w).sum() / w
         for _ in range(_ROUNDS):
@@ -137,19 +155,21 @@ class _Search:
         """Distances from all limits; 1 for a prescribed coefficient."""
         values = _applied(self._rows, x[self._index])
         below = values[: len(self._lower)] - self._lower
-        return np.concatenate([(self._upper - values).ravel(), below.ravel(), np.where(self._fixed, 1.0, x)])
+        ends = (np.where(self._fixed, 1.0, own) for own in (x - self._floor, self._ceiling - x))
+        return np.concatenate([(self._upper - values).ravel(), below.ravel(), *ends])
 
     def _changes(self, dx: Array) -> Array:
         """Changes of the slacks with coefficients."""
         values = _applied(self._rows, dx[self._index])
-        return np.concatenate([-values.ravel(), values[: len(self._lower)].ravel(), dx])
+        return np.concatenate([-values.ravel(), values[: len(self._lower)].ravel(), dx, -dx])
 
     def _by_row(self, values: Array, sign: float) -> tuple[Array, Array]:
         """Values of the slacks of both limits of each row, with a sign of the upper one; those of coefficients."""
         count, two = self._upper.size, self._lower.size
         rows = sign * values[:count].reshape(self._upper.shape)
         rows[: len(self._lower)] += values[count : count + two].reshape(self._lower.shape)
-        return rows, values[count + two :]
+        low, high = values[count + two :].reshape(2, -1)
+        return rows, low + sign * high
 
     def _pulled(self, values: Array) -> Array:
         """Transposed changes of the slacks."""
@@ -172,7 +192,10 @@ class _Search:
             terms[np.stack([fixed[i] | fixed[j] for i, j in self._pairs])] = 0.0
         bands = _summed(self._place, terms, (self._bandwidth + 1) * self._size).reshape(self._bandwidth + 1, self._size)
         bands[0] += np.where(self._fixed, 1.0, own)
-        factor = cholesky_banded(bands, lower=True, check_finite=False, overwrite_ab=True)
+        try:
+            factor = cholesky_banded(bands, lower=True, check_finite=False, overwrite_ab=True)
+        except LinAlgError:  # rates without bound
+            raise ValueError(UNBOUNDED) from None
         free = ~self._fixed
         return lambda right: free * cho_solve_banded((factor, True), free * right, check_finite=False)
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctrlplan.planning.bounds import Bound
+from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.interior_point import Problem, minimum
-from ctrlplan.planning.path_law.rows import POINTS, Activity, Rows, basis
+from ctrlplan.planning.path_law.rows import POINTS, Activity, Rows
 from ctrlplan.planning.path_law.spans import Part, Rates, parts_of
 from ctrlplan.planning.path_law.sweep import swept
 from ctrlplan.trajectories import Retimed, TimeLaw, Trajectory
@@ -18,9 +19,6 @@ from ctrlplan.trajectories.common import Array, readonly
 
 _NODES, _WEIGHTS = (readonly(0.5 * values) for values in np.polynomial.legendre.leggauss(4) + np.array([[1.0], [0.0]]))
 """Quadrature of the duration of a cell."""
-
-_MEANS = readonly(np.array([1.0, 3.0, 3.0, 1.0]) / 8.0)
-"""Quadrature at the points at which limits are evaluated."""
 
 _LOSS = 5e-3
 """Mean distance from the nearest limit over the time of the plan below which cells are not divided any more."""
@@ -75,45 +73,49 @@ def fastest_law(
     ValueError
         If the rate is not limited, or velocities at the ends are infeasible.
     """
-    edges = [time - start + plan.start for bound in bounds for time in _changes(bound)]
+    edges = [time - start + plan.start for bound in bounds for time in changes(bound)]
     parts = parts_of(plan, any(bound.order == 2 for bound in bounds), edges, given)
     grid = Grid.of(plan, [part for part in parts if part.moves])
     for refinement in range(_REFINEMENTS + 1):
         spline, activity = Spline.of(grid), Activity.of(grid, bounds, POINTS, start)
-        rows = activity.rows(grid.length).with_reserve(reserve, *grid.ends(moving=True))
-        problem = _problem(grid, spline, rows)
+        rows = activity.rows(grid.length).with_reserve(POINTS.size, reserve, *grid.ends(moving=True))
+        problem = problem_of(grid, spline, rows)
         x = swept(grid, spline, rows)
         scale = _START if any(given) else _START * problem.feasible_scale(x)
         x = minimum(problem, np.where(spline.fixed, x, scale * x))
         local = spline.coefficients(x)
-        loss = _losses(activity.worst(POINTS, local, grid.length), local, grid.length)
+        loss = losses(activity, local, grid.length)
         if loss.sum() < _LOSS or refinement == _REFINEMENTS:
             break
         grid = grid.divided(np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int))
     return FastLaw(Retimed(plan, _law(plan, parts, grid, local)), _corners(plan, parts))
 
 
-def _changes(bound: Bound) -> tuple[float, ...]:
+def changes(bound: Bound) -> tuple[float, ...]:
     """Times [s] of the given plan at which limits begin, end or have a kink."""
     return (*(bound.interval or ()), *(bound.profile.times if bound.profile is not None else ()))
 
 
-def _problem(grid: Grid, spline: Spline, rows: Rows) -> Problem:
+def problem_of(grid: Grid, spline: Spline, rows: Rows) -> Problem:
     """Duration by quadrature, and inequalities, for the coefficients of a spline."""
-    values = np.repeat(basis(_NODES)[0][:, None], grid.length.size, axis=1)
+    degree = len(spline.index) - 1
+    values = np.repeat(bernstein(_NODES, degree)[:, None], grid.length.size, axis=1)
     weights = _WEIGHTS[:, None] * grid.length
     # 1/sqrt(b) is integrated by the square root of the distance from a point at which b is 0.
     root = 2.0 * _NODES[:, None]
     first, last = grid.ends(moving=False)
-    values[:, first], weights[:, first] = basis(_NODES**2)[0][:, None], weights[:, first] * root
-    values[:, last], weights[:, last] = basis(1.0 - _NODES**2)[0][:, None], weights[:, last] * root
+    values[:, first], weights[:, first] = bernstein(_NODES**2, degree)[:, None], weights[:, first] * root
+    values[:, last], weights[:, last] = bernstein(1.0 - _NODES**2, degree)[:, None], weights[:, last] * root
     return Problem(spline, spline.rows(values), weights, spline.rows(rows.factors), rows.upper, rows.lower)
 
 
-def _losses(worst: Array, local: Array, sizes: Array) -> Array:
+def losses(activity: Activity, local: Array, lengths: Array) -> Array:
     """Distance of each cell from the nearest limit, weighted by its part of the duration."""
-    durations = sizes / np.sqrt(_MEANS @ (basis(POINTS)[0] @ local))
-    distance = _MEANS @ np.maximum(1.0 - worst, 0.0)
+    points, degree = activity.points, len(local) - 1
+    weights = bernstein(points, points.size - 1)
+    means = np.linalg.solve(weights.T, np.full(points.size, 1.0 / points.size))  # exact quadrature of polynomials
+    durations = lengths / np.sqrt(means @ (bernstein(points, degree) @ local))
+    distance = means @ np.maximum(1.0 - activity.worst(local, lengths), 0.0)
     return distance * durations / durations.sum()
 
 

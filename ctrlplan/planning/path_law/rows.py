@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.planning.bounds import Bound
+from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid
 from ctrlplan.trajectories.common import Array, readonly
 
-_POINTS = readonly(np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0]))
+POINTS = readonly(np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0]))
 """Points of a cell at which limits are evaluated."""
 
-_CONTROL = readonly(
-    np.linalg.inv(np.stack([(1, 3, 3, 1)[k] * (1.0 - _POINTS) ** (3 - k) * _POINTS**k for k in range(4)], axis=1))
-)
-"""Bernstein coefficients of a cubic polynomial by its values at these points."""
+
+SMOOTH_POINTS = readonly(0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 6)))
+"""The same with limits of the jerk, which vanishes at points of rest."""
 
 _FAR = 1e4
 """Magnitude of a missing limit, relative to that on the other side."""
@@ -30,7 +30,7 @@ class Rows:
 
     Attributes
     ----------
-    factors : ndarray, shape (nrows, ncells, 3)
+    factors : ndarray, shape (nrows, ncells, degree + 1)
         Of the Bernstein coefficients of a cell.
     upper : ndarray, shape (nrows, ncells)
         Upper limits, above 0.
@@ -42,19 +42,13 @@ class Rows:
     upper: Array
     lower: Array
 
-    def with_reserve(self, reserve: float, first: NDArray[np.intp], last: NDArray[np.intp]) -> Rows:
+    def with_reserve(self, npoints: int, reserve: float, first: NDArray[np.intp], last: NDArray[np.intp]) -> Rows:
         """Rows at a distance from the limits, without those of the given speeds where cells begin or end."""
         if not (reserve or first.size or last.size):
             return self
         upper = (1.0 - reserve) * self.upper
-        upper[-_POINTS.size, first] = upper[-1, last] = _FAR
+        upper[-npoints, first] = upper[-1, last] = _FAR
         return Rows(self.factors, upper, (1.0 - reserve) * self.lower)
-
-
-def basis(u: Array) -> tuple[Array, Array]:
-    """Quadratic Bernstein polynomials (npoints, 3) and their derivatives."""
-    v = 1.0 - u
-    return np.stack([v * v, 2.0 * u * v, u * u], axis=1), np.stack([-2.0 * v, 2.0 - 4.0 * u, 2.0 * u], axis=1)
 
 
 @dataclass(frozen=True)
@@ -69,20 +63,26 @@ class Activity:
         Acceleration over half the distance of its limits, by b'/2 and by b.
     centre : ndarray, shape (nbounds, npoints, ncells)
         Mean of the limits in this scale.
+    jerks : ndarray, shape (nlimits, 3, npoints, ncells)
+        Jerk over each limit and sqrt(b), by b''/2, 3 b'/2 and b.
+    points : ndarray, shape (npoints,)
+        Points of a cell, from 0 to 1.
     """
 
     speeds: Array
     tangent: Array
     curvature: Array
     centre: Array
+    jerks: Array
+    points: Array
 
     @classmethod
     def of(cls, grid: Grid, bounds: Sequence[Bound], points: Array, start: float) -> Activity:
         """Limits at points of a grid; `start` is that of the plan for which they are given."""
-        first, second = grid.jets(points)
+        first, second, *third = grid.jets(points, max(2, *(bound.order for bound in bounds)))
         inner = np.clip(points, 1e-9, 1.0 - 1e-9)
         times = start + grid.times(inner) - grid.plan.start
-        speeds, rows = np.zeros(times.shape), []
+        speeds, rows, jerks = np.zeros(times.shape), [], []
         for bound in bounds:
             low, high = bound.sides(times)
             if bound.order == 1:
@@ -96,29 +96,66 @@ class Activity:
                 applies = np.isfinite(half)
                 half, mean = np.where(applies, half, np.inf), np.where(applies, 0.5 * (high + low), 0.0)
                 rows.append((first[bound.axis] / half, second[bound.axis] / half, mean / half))
+            elif bound.order == 3:
+                own = np.stack([derivative[bound.axis] for derivative in (first, second, *third)])
+                jerks += [own / side for side in (high, low) if np.isfinite(side).any()]
         tangent, curvature, centre = np.array(rows).swapaxes(0, 1) if rows else np.empty((3, 0, *times.shape))
-        return cls(speeds, tangent, curvature, centre)
+        return cls(speeds, tangent, curvature, centre, np.array(jerks).reshape(-1, 3, *times.shape), points)
 
-    def rows(self, length: Array) -> Rows:
-        """Inequalities for the control points of both signals in each cell."""
-        values, slopes = basis(_POINTS)
-        shape = (-1, length.size, 3)
-        speeds = np.einsum("ab,bc,bm->acm", _CONTROL, self.speeds, values)
-        slope = 0.5 * np.einsum("ab,kbc,bm->kacm", _CONTROL, self.tangent / length, slopes)
-        factors = slope + np.einsum("ab,kbc,bm->kacm", _CONTROL, self.curvature, values)
-        shift = np.einsum("ab,kbc->kac", _CONTROL, self.centre).reshape(-1, length.size)
+    @property
+    def _control(self) -> Array:
+        """Bernstein coefficients of a polynomial by its values at the points."""
+        own: Array = np.linalg.inv(bernstein(self.points, self.points.size - 1))  # type: ignore[assignment]
+        return own
+
+    def rows(self, length: Array, former: Array | None = None) -> Rows:
+        """Inequalities for the control points of all signals in each cell.
+
+        Parameters
+        ----------
+        length : ndarray, shape (ncells,)
+            Lengths of the cells.
+        former : ndarray, shape (degree + 1, ncells), optional
+            Bernstein coefficients about which limits of the jerk are linear; default:
+            none, for a quadratic squared rate.
+        """
+        degree = 2 if former is None else len(former) - 1
+        values, slopes = bernstein(self.points, degree), bernstein(self.points, degree, 1)
+        shape = (-1, length.size, degree + 1)
+        speeds = np.einsum("ab,bc,bm->acm", self._control, self.speeds, values)
+        slope = 0.5 * np.einsum("ab,kbc,bm->kacm", self._control, self.tangent / length, slopes)
+        factors = slope + np.einsum("ab,kbc,bm->kacm", self._control, self.curvature, values)
+        shift = np.einsum("ab,kbc->kac", self._control, self.centre).reshape(-1, length.size)
         upper = np.concatenate([1.0 + shift, np.ones(self.speeds.shape)])
-        return Rows(np.concatenate([factors.reshape(shape), speeds]), upper, shift - 1.0)
+        blocks = [factors.reshape(shape), speeds]
+        if former is not None:
+            blocks.insert(1, self._jerk_rows(length, former).reshape(shape))
+            upper = np.concatenate([upper, np.ones((len(blocks[1]), length.size))])
+        return Rows(np.concatenate(blocks), upper, shift - 1.0)
 
-    def worst(self, points: Array, local: Array, length: Array) -> Array:
-        """Signals relative to their limits (npoints, ncells), 1 at a limit, by Bernstein coefficients (3, ncells)."""
-        values, slopes = basis(points)
-        b, half_slope = values @ local, 0.5 * (slopes @ local) / length
+    def _jerk_rows(self, length: Array, former: Array) -> Array:
+        """Rows (nlimits, npoints, ncells, degree + 1) of the jerk: R <= 1/sqrt(b), whose right side is convex.
+
+        Its tangent at the former squared rate b_0 is 3/(2 sqrt(b_0)) - b/(2 sqrt(b_0)^3).
+        """
+        degree = len(former) - 1
+        values, slopes, bends = (bernstein(self.points, degree, nu) for nu in range(3))
+        b = (values @ former)[None, :, :, None]
+        first, second, third = (self.jerks[:, k, :, :, None] for k in range(3))
+        h = length[None, None, :, None]
+        values, slopes, bends = (own[None, :, None] for own in (values, slopes, bends))
+        signal = third * values + 1.5 * second * slopes / h + 0.5 * first * bends / h**2
+        return np.einsum("ab,kbcm->kacm", self._control, signal * np.sqrt(b) / 1.5 + values / (3.0 * b))
+
+    def worst(self, local: Array, length: Array) -> Array:
+        """Signals relative to their limits (npoints, ncells), by Bernstein coefficients (degree + 1, ncells)."""
+        degree, points = len(local) - 1, self.points
+        b, slope = bernstein(points, degree) @ local, bernstein(points, degree, 1) @ local / length
         found = np.sqrt(np.maximum(self.speeds * b, 0.0))
         for tangent, curvature, centre in zip(self.tangent, self.curvature, self.centre, strict=True):
-            value = tangent * half_slope + curvature * b
+            value = tangent * 0.5 * slope + curvature * b
             found = np.maximum(found, np.maximum(value / (1.0 + centre), value / (centre - 1.0)))
+        bend = bernstein(points, degree, 2) @ local / length**2
+        for first, second, third in self.jerks:
+            found = np.maximum(found, (third * b + 1.5 * second * slope + 0.5 * first * bend) * np.sqrt(b))
         return found
-
-
-POINTS = _POINTS

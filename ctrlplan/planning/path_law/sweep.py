@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ctrlplan.planning.path_law.grid import Grid, Spline
+from ctrlplan.planning.path_law.interior_point import UNBOUNDED
 from ctrlplan.planning.path_law.rows import Rows
 from ctrlplan.planning.path_law.spans import Rates
 from ctrlplan.trajectories.common import Array
@@ -12,7 +13,7 @@ from ctrlplan.trajectories.common import Array
 _ROUNDS = 4
 """Rounds over a closed part, until its end is consistent with its start."""
 
-_FAR = 1e30
+_FAR = 1e100
 """Squared rate without a limit."""
 
 
@@ -33,10 +34,7 @@ def swept(grid: Grid, spline: Spline, rows: Rows) -> Array:
     for part, begin, end in zip(grid.parts, firsts, [*firsts[1:], grid.part.size], strict=True):
         starts = cells.closed(begin, end) if part.closed else cells.open(begin, end, part.rates)
         if not starts.max() < 1e-3 * _FAR:
-            raise ValueError(
-                "limits must bound the speed along the whole path, got a part of it with limits of accelerations only "
-                "that starts and ends in motion; limit the velocities"
-            )
+            raise ValueError(UNBOUNDED)
         index, ends = spline.index[:, begin:end], starts[1:] / cells.gains[begin:end]
         if not part.closed:
             x[index[0, 0]], x[index[2, -1]] = starts[0], ends[-1]

@@ -1,0 +1,141 @@
+"""Time law of minimum duration under limits of the jerk, by a sequence of convex problems.
+
+The jerk is sqrt(b) R with R = p''' b + 3 p'' b'/2 + p' b''/2, so that its limit is
+R <= j/sqrt(b). The right side is convex, and its tangent at a feasible b is a stronger
+limit, linear in b: solutions of the problems with these limits are feasible, and their
+durations decrease. The last one is a local minimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.planning.bounds import Bound
+from ctrlplan.planning.path_law.bernstein import bernstein
+from ctrlplan.planning.path_law.grid import Grid, Spline
+from ctrlplan.planning.path_law.interior_point import minimum
+from ctrlplan.planning.path_law.law import FastLaw, changes, losses, problem_of
+from ctrlplan.planning.path_law.rows import SMOOTH_POINTS, Activity
+from ctrlplan.planning.path_law.spans import Part, parts_of
+from ctrlplan.trajectories import PiecewisePolynomial, Retimed, Trajectory
+from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
+
+_ROUNDS, _GAIN = 25, 1e-3
+"""Maximum number of problems on a grid, and the decrease of the duration, relative to it, that ends them."""
+
+_LOSS, _REFINEMENTS, _PIECES = 2e-2, 2, 3
+"""As for limits of the acceleration; signals are at no limit while the jerk changes its sign."""
+
+_START = 0.8
+"""Squared rate of the start relative to the largest constant one."""
+
+_NODES, _WEIGHTS = (readonly(0.5 * own) for own in np.polynomial.legendre.leggauss(24) + np.array([[1.0], [0.0]]))
+"""Quadrature of the duration of a cell."""
+
+_ENDS = readonly(np.array([0.0, 1.0]))
+
+
+def fastest_smooth_law(plan: Trajectory, bounds: Sequence[Bound], start: float) -> FastLaw:
+    """Time law of minimum duration under limits up to the jerk.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        Plan with a duration and a continuous acceleration.
+    bounds : sequence of Bound
+        Limits of derivatives of axes up to order 3.
+    start : float
+        Start [s] of the plan for which limits over time are given.
+    """
+    parts = parts_of(plan, True, [time - start + plan.start for bound in bounds for time in changes(bound)])
+    grid = Grid.of(plan, [part for part in parts if part.moves])
+    spline, activity = Spline.quartic(grid), Activity.of(grid, bounds, SMOOTH_POINTS, start)
+    x = np.full(spline.size, _START * _constant(grid, activity))
+    for refinement in range(_REFINEMENTS + 1):
+        local = _converged(grid, spline, activity, x)
+        loss = losses(activity, local, grid.length)
+        if loss.sum() < _LOSS or refinement == _REFINEMENTS:
+            break
+        counts = np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int)
+        local, grid = on_pieces(local, counts), grid.divided(counts)
+        spline, activity = Spline.quartic(grid), Activity.of(grid, bounds, SMOOTH_POINTS, start)
+        x = spline.near(local)
+    return FastLaw(Retimed(plan, smooth_law(plan, parts, grid, local)), ())
+
+
+def _constant(grid: Grid, activity: Activity) -> float:
+    """Largest constant squared rate within the limits."""
+    ones = np.ones((5, grid.length.size))
+    without = replace(activity, jerks=activity.jerks[:0])
+    speeds = float(activity.speeds.max())
+    others = float(without.worst(ones, grid.length).max())  # of the accelerations, or root of `speeds`
+    jerks = float(activity.worst(ones, grid.length).max())
+    return 1.0 / max(speeds, others if others > speeds**0.5 else 0.0, (jerks if jerks > others else 0.0) ** (2.0 / 3.0))
+
+
+def _converged(grid: Grid, spline: Spline, activity: Activity, x: Array) -> Array:
+    """Bernstein coefficients (degree + 1, ncells) of a local minimum."""
+    last = np.inf
+    for _ in range(_ROUNDS):
+        problem = problem_of(grid, spline, activity.rows(grid.length, spline.coefficients(x)))
+        x = minimum(problem, x)
+        duration = problem.duration(x)
+        if duration > (1.0 - _GAIN) * last:
+            break
+        last = duration
+    return spline.coefficients(x)
+
+
+def on_pieces(local: Array, counts: NDArray[np.intp]) -> Array:
+    """Bernstein coefficients on the pieces of divided cells."""
+    degree = len(local) - 1
+    points = np.linspace(0.0, 1.0, degree + 1)
+    cell = np.repeat(np.arange(counts.size), counts)
+    since = np.arange(cell.size) - (np.cumsum(counts) - counts)[cell]
+    values = np.empty((degree + 1, cell.size))
+    for count in np.unique(counts).tolist():
+        for part in range(count):
+            chosen = (counts[cell] == count) & (since == part)
+            values[:, chosen] = bernstein((part + points) / count, degree) @ local[:, cell[chosen]]
+    own: Array = np.linalg.solve(bernstein(points, degree), values)  # type: ignore[assignment]
+    return own
+
+
+def smooth_law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array) -> PiecewisePolynomial:
+    """Time law of degree 9 with the rate and three of its derivatives, from the squared rate, at the ends of cells."""
+    dwells = [span for part in parts if not part.moves for span in part.spans]
+    places = np.append(
+        plan.breakpoints[grid.segment] + grid.start, [plan.breakpoints[s.segment] + s.start for s in dwells]
+    )
+    lengths = np.append(grid.length, [span.length for span in dwells])
+    table = np.append(local, np.ones((len(local), len(dwells))), axis=1)
+    order = np.argsort(places)
+    places, lengths, table = places[order], lengths[order], table[:, order]
+    degree = len(table) - 1
+    durations = lengths * (_WEIGHTS @ (1.0 / np.sqrt(bernstein(_NODES, degree) @ table)))
+    b, slope, bend, third = (bernstein(_ENDS, degree, nu) @ table / lengths**nu for nu in range(4))
+    rate = np.sqrt(b)
+    ends = np.stack([np.zeros_like(rate), rate, 0.5 * slope, 0.5 * bend * rate, 0.5 * third * b + 0.25 * bend * slope])
+    ends[0, 1] = lengths
+    coefficients = _hermite(ends, durations)
+    coefficients[-1] = places
+    times = plan.start + np.append(0.0, np.cumsum(durations))
+    return PiecewisePolynomial(times, coefficients[:, :, None], labels=["s"])
+
+
+def _hermite(ends: Array, durations: Array) -> Array:
+    """Coefficients (2 n, ncells), highest power first, by n derivatives (n, 2, ncells) at both ends of each cell."""
+    count = len(ends)
+    factorials = FACTORIALS[:count]
+    scaled = ends * durations ** np.arange(count)[:, None, None] / factorials[:, None, None]
+    low, high = scaled[:, 0], scaled[:, 1]
+    binomials = np.array(
+        [[np.prod(np.arange(k - nu + 1, k + 1)) / factorials[nu] for k in range(2 * count)] for nu in range(count)]
+    )
+    rest = high - binomials[:, :count] @ low
+    powers = np.concatenate([low, np.linalg.solve(binomials[:, count:], rest)])
+    return (powers / durations ** np.arange(2 * count)[:, None])[::-1].copy()

@@ -1,0 +1,200 @@
+"""Time law of a short duration under limits of any signals along a plan, by a sequence of linearised problems.
+
+Signals are functions of the derivatives of the plan in time, and these of b and its
+derivatives by the path parameter: s'^2 = b, s'' = b'/2, s''' = b'' s'/2,
+s'''' = (b''' b + b'' b'/2)/2. They are linearised about the last solution, within a trust
+region; of each solution the largest multiple is taken that satisfies the limits at
+points of all cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ctrlplan.planning.path_law.bernstein import bernstein
+from ctrlplan.planning.path_law.grid import Grid, Spline
+from ctrlplan.planning.path_law.interior_point import minimum
+from ctrlplan.planning.path_law.jerk import smooth_law
+from ctrlplan.planning.path_law.law import problem_of
+from ctrlplan.planning.path_law.rows import Rows
+from ctrlplan.planning.path_law.spans import parts_of
+from ctrlplan.trajectories import Retimed, Trajectory
+from ctrlplan.trajectories.common import FACTORIALS, Array
+from ctrlplan.trajectories.retimed import composed
+
+if TYPE_CHECKING:
+    from ctrlplan.planning.limits import Limited
+
+_POINTS: Array = np.asarray(0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 10)), dtype=float)
+"""Points of a cell at which limits hold."""
+
+_ROUNDS, _GAIN = 30, 5e-4
+"""Maximum number of problems, and the decrease of the duration, relative to it, that ends them."""
+
+_START = 0.95
+"""Squared rate of the start relative to the largest constant one."""
+
+_STEP = 1e-5
+"""Step of the differences by which signals are linearised, relative to the size of b."""
+
+_RESERVE = 1e-4
+"""Distance from limits, relative to their scale, for points between those of the cells."""
+
+_TIGHTENINGS, _BETWEEN = 6, 3e-4
+"""Maximum number of times by which limits are tightened in cells that violate them by so much between the points."""
+
+_INFEASIBLE = 0.05
+"""Violation attributed to a plan that is infeasible for the plant between the points."""
+
+_CHECKS: Array = np.asarray((np.arange(24) + 0.5) / 24.0, dtype=float)
+"""Points at which that is evaluated."""
+
+_FAR = 1e6
+"""Magnitude of a missing limit, in the scale of the other one."""
+
+HIGHEST = 4
+"""Highest derivative of the plan on which signals may depend: the law has four continuous ones."""
+
+
+def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory:
+    """Plan with a fast time law; limits may be slightly violated between points of the cells.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        Plan that satisfies the limits.
+    limited : Limited
+        The limits, of signals that depend on at most `HIGHEST` derivatives.
+    """
+    parts = parts_of(plan, True)
+    grid = Grid.of(plan, [part for part in parts if part.moves])
+    spline = Spline.quartic(grid)
+    signals, between = _Signals(grid, limited, _POINTS), _Signals(grid, limited, _CHECKS)
+    x = np.full(spline.size, _START)
+    scale = signals.feasible_scale(spline.coefficients(x))
+    if not scale:  # no slower plan satisfies the limits with a reserve
+        return plan
+    x = scale * x
+    reserve = np.full(grid.length.size, _RESERVE)
+    for _ in range(_TIGHTENINGS + 1):
+        x = _converged(grid, spline, signals, x, reserve)
+        excess = between.excess(spline.coefficients(x))
+        if excess.max() < _BETWEEN:
+            break
+        reserve += 1.5 * np.maximum(excess, 0.0)
+    return Retimed(plan, smooth_law(plan, parts, grid, spline.coefficients(x)))
+
+
+def _converged(grid: Grid, spline: Spline, signals: _Signals, x: Array, reserve: Array) -> Array:
+    """Coefficients near a local minimum, with a distance (ncells,) from the limits in each cell."""
+    duration, trust = np.inf, 2.0
+    for _ in range(_ROUNDS):
+        problem = replace(problem_of(grid, spline, signals.rows(spline.coefficients(x), reserve)), trust=trust)
+        try:
+            tried = minimum(problem, x)
+        except ValueError:  # the linearised limits cannot be satisfied near this solution
+            trust = trust**0.4
+            if trust < 1.001:
+                break
+            continue
+        scale = signals.feasible_scale(spline.coefficients(tried))
+        gain = 1.0 - problem.duration(scale * tried) / duration
+        if gain > 0.0:
+            x, duration = scale * tried, problem.duration(scale * tried)
+        if (scale > 1.0 - _GAIN and gain < _GAIN) or trust < 1.001:
+            break
+        trust = min(1.5 * trust, 4.0) if gain > 0.0 else trust**0.4
+    return x
+
+
+class _Signals:
+    """Limited signals at points of the cells of a grid."""
+
+    def __init__(self, grid: Grid, limited: Limited, points: Array) -> None:
+        self._grid, self._limited, self._points = grid, limited, points
+        self._order = max(limited.order, 1)
+        times = (grid.start[:, None] + grid.length[:, None] * points).ravel()
+        jet = grid.plan.segments_jet(np.repeat(grid.segment, points.size), times, self._order)
+        self._path = list(jet / FACTORIALS[: self._order + 1, None, None])
+        # Limits of positions do not depend on the time law.
+        self._moving = [k for k, bound in enumerate(limited.bounds) if bound.axis is None or bound.order > 0]
+        bounds = [limited.bounds[k] for k in self._moving]
+        self._scales = np.array([bound.scale for bound in bounds])[:, None]
+        # A limit that is attained at rest has no reserve there.
+        slack = np.array([bound.slack + 2.0 * _RESERVE if bound.slack else 0.0 for bound in bounds])[:, None]
+        low, high = (np.array([[getattr(bound, side)] for bound in bounds]) for side in ("low", "high"))
+        self._low = np.maximum(low / self._scales, -_FAR) - slack
+        self._high = np.minimum(high / self._scales, _FAR) + slack
+
+    def feasible_scale(self, local: Array) -> float:
+        """Largest multiple of a squared rate, up to 1, that satisfies the limits at the points."""
+        derivatives = self._derivatives(local)
+        low, high = 0.0, 1.0
+        if self._satisfies(derivatives):
+            return 1.0
+        for _ in range(30):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._satisfies(middle * derivatives) else (low, middle)
+        return low
+
+    def excess(self, local: Array) -> Array:
+        """Maximum violation in each cell (ncells,), in the scale of the limits."""
+        try:
+            values = self._values(self._derivatives(local))
+        except ValueError:  # infeasible for the plant
+            return np.full(self._grid.length.size, _INFEASIBLE)
+        beyond = np.maximum(values - self._high, self._low - values)
+        return beyond.reshape(len(values), -1, self._points.size).max(axis=(0, 2))
+
+    def rows(self, local: Array, reserve: Array) -> Rows:
+        """Inequalities of the linearised signals for the Bernstein coefficients of the cells."""
+        derivatives = self._derivatives(local)
+        size = np.abs(derivatives[0])
+        steps = [_STEP * size / self._grid.length.repeat(self._points.size) ** nu for nu in range(4)]
+        values, slopes = self._values(derivatives), []
+        for nu, step in enumerate(steps):
+            ahead, behind = derivatives.copy(), derivatives.copy()
+            ahead[nu] += step
+            behind[nu] -= step
+            slopes.append((self._values(ahead) - self._values(behind)) / (2.0 * step))
+        constant = values - sum(slope * own for slope, own in zip(slopes, derivatives, strict=True))
+        shape = (len(values), self._grid.length.size, self._points.size)
+        factors = sum(
+            slope.reshape(shape)[..., None]
+            * bernstein(self._points, len(local) - 1, nu)
+            / self._grid.length[:, None, None] ** nu
+            for nu, slope in enumerate(slopes)
+        )
+        order = (0, 2, 1)
+        upper, lower = (
+            ((side - constant).reshape(shape) - sign * reserve[:, None])
+            .transpose(order)
+            .reshape(-1, self._grid.length.size)
+            for side, sign in ((self._high, 1.0), (self._low, -1.0))
+        )
+        rows = np.asarray(factors).transpose(0, 2, 1, 3).reshape(len(upper), self._grid.length.size, -1)
+        return Rows(rows, upper, lower)
+
+    def _derivatives(self, local: Array) -> Array:
+        """B and its derivatives (4, npoints) at the points of all cells, by Bernstein coefficients."""
+        degree, h = len(local) - 1, self._grid.length
+        found = [(bernstein(self._points, degree, nu) @ local / h**nu).T.ravel() for nu in range(4)]
+        return np.stack(found)
+
+    def _values(self, derivatives: Array) -> Array:
+        """Signals (nbounds, npoints) in the scale of their limits."""
+        b, slope, bend, third = derivatives
+        rate = np.sqrt(np.maximum(b, 1e-300))
+        series = [rate, slope / 4.0, bend * rate / 12.0, (third * b + 0.5 * bend * slope) / 48.0][: self._order]
+        jet = np.stack(composed(self._path, series)) * FACTORIALS[: self._order + 1, None, None]
+        return self._limited.values(jet)[self._moving] / self._scales
+
+    def _satisfies(self, derivatives: Array) -> bool:
+        try:
+            values = self._values(derivatives)
+        except ValueError:  # infeasible for the plant
+            return False
+        return bool(((values <= self._high - 0.5 * _RESERVE) & (values >= self._low + 0.5 * _RESERVE)).all())

@@ -1,0 +1,168 @@
+"""Fastest time law on a path with limited jerk: against Ruckig on lines, and a nonlinear program on a fine grid."""
+
+import numpy as np
+import pytest
+
+import ctrlplan as cp
+from ctrlplan import PiecewiseSpline, PolySpline, TrigSpline, Waypoint, fastest
+from ctrlplan.trajectories import Retimed
+
+COUNT = 20_001
+
+
+def move(order, start=0.0):
+    """From 0 to 1, at rest at the ends up to a derivative."""
+    rest = [0.0] * order
+    return PolySpline([Waypoint.from_jets(start, y=[0.0, *rest]), Waypoint.from_jets(start + 1.0, y=[1.0, *rest])])
+
+
+def random_path(count, naxes, seed):
+    points = np.random.default_rng(seed).normal(size=(naxes, count))
+    times = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points), axis=0)))
+    rest = np.full(count, np.nan)
+    rest[[0, -1]] = 0.0
+    return PiecewiseSpline.from_arrays(times, points, derivatives={1: rest, 2: rest}, warn=False)
+
+
+def limits_of(velocity, acceleration, jerk):
+    return {"velocity": float(velocity), "acceleration": float(acceleration), "jerk": float(jerk)}
+
+
+def check_limits(plan, limits):
+    """Derivatives at many times."""
+    jet = np.abs(plan.jet(np.linspace(plan.start, plan.end, COUNT), 3)).max(axis=(1, 2))
+    for order, name in enumerate(("velocity", "acceleration", "jerk"), 1):
+        if name in limits:
+            assert jet[order] <= limits[name] * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("order", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("limits", [(1, 2, 10), (1, 1, 1), (10, 1, 100), (1, 10, 1000), (0.1, 1, 10)])
+def test_straight_lines_are_those_of_ruckig(order, limits):
+    """The profile of `SCurve` by the same algorithm has seven phases of constant jerk."""
+    ruckig = pytest.importorskip("ruckig")
+    given = ruckig.InputParameter(1)
+    given.current_position, given.target_position = [0.0], [1.0]
+    given.max_velocity, given.max_acceleration, given.max_jerk = ([float(limit)] for limit in limits)
+    profile = ruckig.Trajectory(1)
+    ruckig.Ruckig(1).calculate(given, profile)
+    found = fastest(move(order), limits_of(*limits), hold="path")
+    assert profile.duration * (1 - 1e-9) <= found.duration <= 1.0025 * profile.duration
+    check_limits(found.plan, limits_of(*limits))
+    assert found.active.fraction == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_jerk_limit_alone_in_closed_form():
+    """Four phases of length T/4 with jerk 1: the distance is T^3/32."""
+    found = fastest(move(2), {"jerk": 1.0}, hold="path")
+    assert 32 ** (1 / 3) <= found.duration <= 1.002 * 32 ** (1 / 3)
+
+
+@pytest.mark.slow
+def test_a_path_in_the_plane_is_that_of_a_nonlinear_program():
+    """b at the nodes of a fine grid, derivatives by differences, limits at the nodes, by IPOPT.
+
+    Near the ends b is linear: otherwise the program begins with an acceleration.
+    """
+    casadi = pytest.importorskip("casadi")
+    plan, velocity, acceleration, jerk = random_path(3, 2, 1), 2.0, 4.0, 20.0
+    count = 300
+    s = np.linspace(plan.start, plan.end, count + 1)
+    h = s[1] - s[0]
+    first, second, third = plan.jet(s[1:-1], 3)[1:]
+    b = casadi.MX.sym("b", count + 1)
+    slope, bend = (b[2:] - b[:-2]) / (2 * h), (b[2:] - 2 * b[1:-1] + b[:-2]) / h**2
+    rows, high = [], []
+    for p1, p2, p3 in zip(first, second, third, strict=True):
+        rows += [p1**2 * b[1:-1], p2 * b[1:-1] + 0.5 * p1 * slope]
+        rows += [casadi.sqrt(b[1:-1]) * (p3 * b[1:-1] + 1.5 * p2 * slope + 0.5 * p1 * bend)]
+        high += [velocity**2, acceleration, jerk]
+    for middle in (1, 2, count - 2, count - 1):
+        rows.append(b[middle - 1] - 2 * b[middle] + b[middle + 1])
+    time = 2 * h * casadi.sum1(1 / (casadi.sqrt(b[1:]) + casadi.sqrt(b[:-1])))
+    solver = casadi.nlpsol(
+        "solver",
+        "ipopt",
+        {"x": b, "f": time, "g": casadi.vertcat(*rows)},
+        {"ipopt.print_level": 0, "print_time": False},
+    )
+    upper = np.append(np.repeat(high, count - 1), np.zeros(4))
+    solved = solver(x0=0.1, lbx=1e-4, lbg=-upper, ubg=upper)
+    assert solver.stats()["success"]
+    found = fastest(plan, limits_of(velocity, acceleration, jerk), hold="path")
+    assert found.duration == pytest.approx(float(solved["f"]), rel=0.006)
+    check_limits(found.plan, limits_of(velocity, acceleration, jerk))
+
+
+@pytest.mark.parametrize(("count", "naxes"), [(4, 2), pytest.param(50, 3, marks=pytest.mark.slow)])
+def test_limits_are_satisfied_on_random_paths(count, naxes):
+    plan, limits = random_path(count, naxes, 2), limits_of(2, 4, 20)
+    found = fastest(plan, limits, hold="path")
+    check_limits(found.plan, limits)
+    assert found.margins.satisfied
+    assert found.duration < 0.95 * fastest(plan, limits).duration
+    without = fastest(plan, {"velocity": 2.0, "acceleration": 4.0}, hold="path").duration
+    assert without < found.duration < 1.2 * without
+    assert isinstance(found.plan, Retimed)
+    assert found.plan.jumps(2) == ()
+    s = found.plan.law(np.linspace(found.plan.start, found.plan.end, 501))
+    np.testing.assert_allclose(found.plan(np.linspace(found.plan.start, found.plan.end, 501)), plan(s), atol=1e-12)
+
+
+def test_different_limits_by_sign_and_position():
+    limits = {"y_d2": (-1.0, 3.0), "y_d3": cp.Limits(low=[-20.0, -10.0], high=[20.0, 10.0], along=[0.0, 1.0])}
+    found = fastest(move(2), limits, hold="path")
+    t = np.linspace(found.plan.start, found.plan.end, COUNT)
+    jerk, bound = found.plan(t, 3), 20.0 - 10.0 * found.plan.law(t)
+    assert (np.abs(jerk) <= bound * (1 + 1e-9)).all()
+    acceleration = found.plan(t, 2)
+    assert acceleration.min() >= -1.0 - 1e-9
+    assert acceleration.max() <= 3.0 + 1e-9
+    assert found.margins.satisfied
+    assert found.duration < fastest(move(2), {"y_d2": (-1.0, 3.0), "y_d3": 10.0}, hold="path").duration
+
+
+def test_a_closed_path_stays_closed():
+    cycle = TrigSpline.cyclic([Waypoint(0, [0, 0]), Waypoint(1, [3, 0]), Waypoint(2, [1, 2])], 3.0)
+    found = fastest(cycle, limits_of(2, 3, 15), hold="path").plan
+    first, last = found.jet(found.start, 3), found.jet(found.end, 3, left=True)
+    scale = np.abs(found.jet(np.linspace(found.start, found.end, 101), 3)).max(axis=(1, 2))
+    np.testing.assert_allclose(first / scale[:, None], last / scale[:, None], rtol=0, atol=1e-10)
+    check_limits(found, limits_of(2, 3, 15))
+
+
+@pytest.mark.parametrize("start", [1e5, -3e6])
+def test_the_start_time_does_not_matter(start):
+    found, early = (fastest(move(2, own), limits_of(1, 2, 10), hold="path") for own in (start, 0.0))
+    assert found.duration == pytest.approx(early.duration, rel=1e-8)
+    assert found.plan.start == start
+
+
+def test_stops_and_dwells_remain():
+    dwell = PolySpline([Waypoint(0, 1, 0, 0), Waypoint(2.0, 1, 0, 0)])
+    on = PolySpline([Waypoint(0, 1, 0, 0), Waypoint(1, 2, 0, 0)])
+    limits = limits_of(10, 1, 100)
+    single = fastest(move(2), limits, hold="path").duration
+    assert fastest(move(2).then(dwell).then(on), limits, hold="path").duration == pytest.approx(
+        2 * single + 2.0, rel=0.002
+    )
+    assert fastest(move(2).then(on), limits, hold="path").duration == pytest.approx(2 * single, rel=0.002)
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        (PolySpline([Waypoint(0, 0, 0), Waypoint(1, 1, 0)]), "limits of y_d3 require a plan that is continuous up to"),
+        (PolySpline([Waypoint(0, 0, 1, 0), Waypoint(1, 1, 1, 0)]), "limits must bound the speed along the whole path"),
+    ],
+)
+def test_plans_and_limits_that_are_rejected(plan, message):
+    with pytest.raises(ValueError, match=message):
+        fastest(plan, {"jerk": 10.0}, hold="path")
+
+
+def test_the_plan_is_saved_with_its_law(tmp_path):
+    found = fastest(move(2), limits_of(1, 2, 10), hold="path").plan
+    found.save(tmp_path / "plan.json")
+    t = np.linspace(found.start, found.end, 101)
+    np.testing.assert_array_equal(cp.load_trajectory(tmp_path / "plan.json").jet(t, 3), found.jet(t, 3))

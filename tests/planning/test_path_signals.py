@@ -1,0 +1,101 @@
+"""Fastest time law on a path under limits of quantities: against nonlinear programs on fine grids, and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+
+import ctrlplan as cp
+from ctrlplan import PolySpline, TrigSpline, Waypoint, fastest
+from ctrlplan.studies.crane import CRANE, nominal_waypoints, obstacle_waypoints
+
+HOIST = PolySpline(nominal_waypoints(5))
+OBSTACLE = TrigSpline(obstacle_waypoints(), alpha=4.0)
+
+
+def optimum(plan, guess, limits, count=300):
+    """Duration with b at the nodes of an even grid, by IPOPT.
+
+    The trolley is at x_load + l sin(sway), and its force that of its acceleration, of friction and of the load; time
+    derivatives are differences along the path. Near the ends b is linear: otherwise the program begins with a jump.
+    """
+    casadi = pytest.importorskip("casadi")
+    s = np.linspace(plan.start, plan.end, count + 1)
+    h, p = s[1] - s[0], plan.jet(s[1:-1], 2)
+    b = casadi.MX.sym("b", count + 1)
+    slope = (b[2:] - b[:-2]) / (2 * h)
+    x2, z2 = (p[2, axis] * b[1:-1] + 0.5 * p[1, axis] * slope for axis in (0, 1))
+    rate = casadi.sqrt(b[1:-1])
+    between = 0.5 * (rate[1:] + rate[:-1])
+    rows = []
+    if "F" in limits:
+        trolley = p[0, 0] - (0.25 * casadi.sqrt(x2**2 + (9.81 - z2) ** 2) - p[0, 1] * x2) / (9.81 - z2)
+        velocity = between * (trolley[1:] - trolley[:-1]) / h
+        acceleration = rate[1:-1] * (velocity[1:] - velocity[:-1]) / h
+        force = 5000.0 * acceleration + 10.0 * (velocity[1:] + velocity[:-1]) + 500.0 * x2[1:-1]
+        rows.append(force / limits["F"])
+    if "theta" in limits:
+        rows.append(x2 / (math.tan(limits["theta"]) * (9.81 - z2)))
+    if "velocity" in limits:
+        rows += [p[1, axis] * rate / limits["velocity"] for axis in (0, 1)]
+    size = sum(row.shape[0] for row in rows)
+    rows += [b[k - 1] - 2 * b[k] + b[k + 1] for k in (1, 2, 3, count - 3, count - 2, count - 1)]
+    high = np.append(np.ones(size), np.zeros(6))
+    time = 2 * h * casadi.sum1(1 / (casadi.sqrt(b[1:]) + casadi.sqrt(b[:-1])))
+    problem = {"x": b, "f": time, "g": casadi.vertcat(*rows)}
+    solver = casadi.nlpsol("solver", "ipopt", problem, {"ipopt.print_level": 0, "print_time": False})
+    solved = solver(x0=0.9 * (plan.duration / guess) ** 2, lbx=1e-4, lbg=-high, ubg=high)
+    assert solver.stats()["success"]
+    return float(solved["f"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("plan", "limits"),
+    [
+        (HOIST, {"F": 30e3, "theta": 0.5}),
+        (OBSTACLE, {"theta": 0.08, "velocity": 3.0}),
+    ],
+)
+def test_a_crane_is_as_fast_as_by_a_nonlinear_program(plan, limits):
+    found = fastest(plan, limits, CRANE, hold="path")
+    best = optimum(plan, fastest(plan, limits, CRANE).duration, limits)
+    assert found.duration == pytest.approx(best, rel=0.006)
+    assert found.margins.satisfied
+    assert found.active.fraction == pytest.approx(0.0, abs=1e-8)
+    values = CRANE.quantities(found.plan.jet(np.linspace(found.plan.start, found.plan.end, 20_001), 4))
+    for name in limits.keys() & {"F", "theta"}:
+        assert np.abs(values[name]).max() <= limits[name] * (1 + 1e-8)
+
+
+def test_a_linear_quantity_is_a_limit_of_its_derivative():
+    """A force of 3 times the acceleration: the trapezoid."""
+    move = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 4, 0, 0)])
+    found = fastest(move, {"force": 3.0, "y_d1": 1.0}, lambda jet: {"force": 3.0 * jet[2, 0]}, hold="path")
+    assert 5.0 * (1 - 1e-6) <= found.duration <= 5.0 * 1.006
+
+
+@pytest.mark.slow
+def test_speed_and_torque_in_a_region():
+    """Acceleration 3 - 0.3 v while speeding up, 3 while braking: v = 10 (1 - exp(-0.3 t))."""
+    corners = [(0, 3), (10, 0), (0, -3), (-10, 0)]
+    move = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 10, 0, 0)])
+    found = fastest(move, {"motor": cp.Region(("y_d1", "y_d2"), corners)}, hold="path")
+    jet = found.plan.jet(np.linspace(found.plan.start, found.plan.end, 20_001), 2)[:, 0]
+    assert (np.abs(jet[1]) / 10 + np.abs(jet[2]) / 3).max() <= 1 + 1e-9
+    # From both ends to the speed at which the ways add up; braking is bounded by 3 - 0.3 v as well.
+    t = np.linspace(0, 4, 400_001)
+    way = 10 * t - (10 / 0.3) * (1 - np.exp(-0.3 * t))
+    best = 2 * t[np.searchsorted(way, 5.0)]
+    assert best * (1 - 1e-4) <= found.duration <= best * 1.006
+
+
+def test_a_closed_plan_stays_closed():
+    cycle = TrigSpline.cyclic([Waypoint(0, [0, 0]), Waypoint(1, [3, 0]), Waypoint(2, [1, 2])], 3.0)
+    found = fastest(cycle, {"speed": 2.0}, lambda jet: {"speed": np.hypot(jet[1, 0], jet[1, 1])}, hold="path")
+    first, last = found.plan.jet(found.plan.start, 3), found.plan.jet(found.plan.end, 3, left=True)
+    scale = np.abs(found.plan.jet(np.linspace(found.plan.start, found.plan.end, 101), 3)).max(axis=(1, 2))
+    np.testing.assert_allclose(first / scale[:, None], last / scale[:, None], rtol=0, atol=1e-9)
+    t = np.linspace(cycle.start, cycle.end, 200_001)
+    length = np.hypot(*cycle(t, 1)).mean() * cycle.duration
+    assert length / 2.0 * (1 - 1e-6) <= found.duration <= length / 2.0 * 1.006
