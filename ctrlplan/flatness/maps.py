@@ -269,6 +269,15 @@ class FlatMaps:
         """Error that names the entry of z that is not determined."""
         return SingularError(f"{self.weakest(z, p)} is not determined by the flat outputs there", place)
 
+    def is_regular(self, z: Array, p: Array) -> bool:
+        """Whether a state is determined by its flags, and the controls by the highest derivatives, as at the start."""
+
+        def matrices(at: Array) -> tuple[Array, Array]:
+            return self.slopes(at, p) * self.scales, self.last(at, self.mu, p)[:, 1:] * self.mu_scales
+
+        pairs = zip(matrices(self.start), matrices(z), strict=True)
+        return all(regularity(b, np.abs(a).max(axis=1)) > 1e-6 * regularity(a) for a, b in pairs)
+
     def weakest(self, z: Array, p: Array) -> str:
         """Name of the entry of z that the flags determine worst."""
         scaled = self.slopes(z, p) * self.scales

@@ -17,7 +17,7 @@ from scipy.linalg import solve_continuous_are
 from ctrlplan._checks import check_kind, check_signals, checked_vector, real_array
 from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, EventName, Params, Value
-from ctrlplan.flatness import DerivedFlatSystem, FlatSystem
+from ctrlplan.flatness import DerivedFlatSystem, FlatSystem, flat_system
 from ctrlplan.systems.derived_laws import InputLimits, create_derived_law, input_bounds
 from ctrlplan.systems.flat import create_flat_iosystem, derived_system_of
 from ctrlplan.systems.source import create_source_iosystem
@@ -262,7 +262,7 @@ def flat_loop(
     >>> found.outputs["angle"].round(6).tolist()
     [0.0, 1.0, 2.0]
     """
-    check_kind(flat, "flat", FlatSystem)
+    flat = _own(flat)
     check_kind(plan, "plan", Trajectory)
     if (poles is None) == (law is None):
         raise TypeError("one of poles and law must be given, got " + ("neither" if law is None else "both"))
@@ -300,6 +300,16 @@ def _check_no_step(plan: Trajectory, flat: FlatSystem) -> None:
             f"plan must be continuous for a law of {flat.name}, got a step of {jump.label} by {jump.size:.4g} at "
             f"{jump.time:g} s; give a plan at rest at the goal, and initial_state= from which it is approached"
         )
+
+
+def _own(flat: fs.FlatSystem) -> FlatSystem:
+    """Flat system of this package for one of python-control."""
+    if isinstance(flat, fs.LinearFlatSystem):
+        return flat_system(flat, list(flat.output_labels))
+    if isinstance(flat, fs.FlatSystem) and not isinstance(flat, FlatSystem):
+        return derived_system_of(flat, True) or flat
+    check_kind(flat, "flat", FlatSystem, "a flat system")
+    return flat
 
 
 def _wrong_state(given: Value, flat: FlatSystem) -> Array:

@@ -152,6 +152,10 @@ def test_the_extension_starts_where_it_is_told_to():
     for wrong in ([1.0], [1.0, np.nan], [[1.0, 2.0]]):
         with pytest.raises(ValueError, match="start"):
             cp.create_flat_iosystem(flat, [FAST, FAST], start=wrong)
+    wheel = cp.flat_system(CASES["unicycle"].plant, ["x", "y"], at={"v": 1.0})
+    for speed in (0.0, 1e-9):
+        with pytest.raises(ValueError, match=r"start must be .* at which the law of unicycle is regular"):
+            cp.create_flat_iosystem(wheel, [[-1.0, -2.0]] * 2, start=[speed])
 
 
 def test_labels_and_suffix_name_the_references():
