@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from copy import copy
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_finite
 from ctrlplan._display import Facts, Part
@@ -37,6 +38,10 @@ if TYPE_CHECKING:
 
 _PERIODIC = 1e-6
 """Difference of states one period apart, relative to their size, that is attributed to rounding."""
+
+
+_TURN_SAMPLES = 401
+"""Times at which angles along a plan are evaluated."""
 
 
 class DerivedFlatSystem(FlatSystem):
@@ -193,11 +198,15 @@ class DerivedFlatSystem(FlatSystem):
 
     def extension_along(self, plan: Trajectory, time: float) -> Array:
         """States of the extension (extension,) at a time of a plan."""
-        plan, times = self._folded(*self._along(plan, time, None))
+        return self.extended_along(plan, time)[self.maps.nstates :, 0]
+
+    def extended_along(self, plan: Trajectory, timepts: ArrayLike) -> Array:
+        """States of the plant and of the extension (nstates + extension, ntime) along a plan."""
+        plan, times = self._folded(*self._along(plan, timepts, None))
         p, jet = self.parameter_values(), plan.jet(times.ravel(), max(self.orders))
         z, u = states_along(self.maps, self._grid(plan, p, None), jet, times.ravel(), p, str(self.name))
         self._check_determined(z[: self.maps.nstates], u, plan, times.ravel())
-        return z[self.maps.nstates :, 0]
+        return z
 
     def linearised(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
         """Jacobians of the rates.
@@ -253,6 +262,32 @@ class DerivedFlatSystem(FlatSystem):
             check_end(plan, f"a plan along which states of {self.name} are not periodic")
         return plan.plan, plan.first_pass(times.ravel()).reshape(times.shape)
 
+    def check_limits(self, plan: Trajectory, names: Set[str]) -> None:
+        """Raise if an angle is to be limited that a plan turns by more than half a turn from the operating point.
+
+        A jet does not state the number of turns.
+
+        Parameters
+        ----------
+        plan : Trajectory
+            Plan of the flat outputs.
+        names : set of str
+            Limited signals.
+        """
+        angles = zip(self.state_labels, self._angles[: self.maps.nstates].tolist(), strict=True)
+        limited = [k for k, (name, is_angle) in enumerate(angles) if is_angle and name in names]
+        if not limited:
+            return
+        x = self.states_and_inputs(plan, np.linspace(plan.start, plan.end, _TURN_SAMPLES))[0]
+        turned = np.abs(x - self.maps.start[: self.maps.nstates, None]).max(axis=1)
+        for k in limited:
+            if turned[k] >= math.pi:
+                raise ValueError(
+                    f"{self.state_labels[k]} must stay within half a turn of the operating point to be limited, got "
+                    f"{turned[k]:.4g} rad; limit the parts of the plan one by one with at= for each, or evaluate "
+                    "states_and_inputs"
+                )
+
     def _grid(self, plan: Trajectory, p: Array, start: Array | None) -> Grid:
         """Grid of a plan, kept for the next call."""
         key = (id(plan), p.tobytes(), b"" if start is None else start.tobytes())
@@ -289,23 +324,33 @@ class DerivedFlatSystem(FlatSystem):
         return z[: self.maps.nstates].reshape(-1, *trailing), u.reshape(-1, *trailing)
 
     def _states(self, flags: Array, p: Array) -> Array:
-        """Extended states (nz, n) of flags (nz, n): the first from the operating point, then neighbour by neighbour."""
+        """Extended states (nz, n) of flags (nz, n): the first from the operating point, then neighbour by neighbour.
+
+        Angles are continuous from each flag to the next.
+        """
         maps = self.maps
         z = np.full(flags.shape, np.nan)
         near, left = maps.start, np.arange(flags.shape[1])
         while left.size:
             trial, found = maps.refined(np.repeat(near[:, None], left.size, axis=1), flags[:, left], p)
+            found &= maps.same_side(trial, p)
             z[:, left[found]] = trial[:, found]
             left = left[~found]
             if left.size:
                 k = int(left[0])
                 if k:
-                    near = connected_with_neighbour(maps, flags[:, k], p, near, str(self.name), flags.shape[1])
+                    near = connected_with_neighbour(maps, flags[:, k], p, z[:, k - 1], str(self.name))
                 else:
                     near = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
                 z[:, k] = near
                 left = left[1:]
+        z[self._angles] = np.unwrap(z[self._angles])
         return z
+
+    @cached_property
+    def _angles(self) -> NDArray[np.bool_]:
+        """States of the extended plant that are angles."""
+        return self.maps.angles(self.parameter_values())
 
     def _extended(self, state: Array, plan: Trajectory, p: Array) -> Array:
         """Extended state at the start of a plan for a given state of the plant."""

@@ -25,6 +25,9 @@ from ctrlplan.traits import declare, traits_of
 from ctrlplan.trajectories import PathPlan, Trajectory
 from ctrlplan.trajectories.trajectory import check_end
 
+_CHECKED = 401
+"""Times along a plan at which a law without states must be regular."""
+
 _SETTLED = 1e-9
 """Size of the rates at the end of a plan, relative to their terms, below which the plant rests there."""
 
@@ -59,6 +62,11 @@ class FlatLaw(Displayed):
         if derived is None:
             return create_flat_iosystem(flat, self.poles, labels=flat.flat_labels, name="law")
         start = None if self.quasi_static else derived.extension_along(plan, plan.start)
+        if self.quasi_static and derived.extension:
+            from ctrlplan.flatness.feedback import check_law_along
+
+            times = np.linspace(plan.start, plan.end, _CHECKED)
+            check_law_along(derived.analysis, derived.extended_along(plan, times), times, str(flat.name))
         return create_derived_law(
             derived,
             self.poles,

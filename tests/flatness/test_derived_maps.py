@@ -513,3 +513,29 @@ def test_margins_over_ranges_of_parameters():
     assert found.active.fraction == pytest.approx(known.active.fraction, rel=1e-8)
     with pytest.raises(ValueError, match="params must be among"):
         cp.margins(plan, limits, flat, params={"load": 1.0})
+
+
+@pytest.mark.parametrize("count", [7, 401])
+def test_angles_of_quantities_are_continuous_along_the_plan(count):
+    """Two circles: the heading grows by two turns, and the speed does not change its sign."""
+    t = np.linspace(3.0, 18.0, count)
+    flat = derived(CASES["unicycle"])
+    found = flat.quantities(AROUND.jet(t, 2))
+    (_, _, heading), (speed, turning) = unicycle_map(AROUND.jet(np.linspace(0.0, 18.0, 1801), 2))
+    np.testing.assert_allclose(found["v"], np.interp(t, np.linspace(0.0, 18.0, 1801), speed), rtol=1e-6)
+    if count > 50:
+        np.testing.assert_allclose(
+            np.diff(found["th"]), np.diff(np.interp(t, np.linspace(0, 18, 1801), heading)), atol=1e-6
+        )
+        np.testing.assert_allclose(found["w"], np.interp(t, np.linspace(0.0, 18.0, 1801), turning), rtol=1e-6)
+    shuffled = np.random.default_rng(0).permutation(count)
+    np.testing.assert_allclose(flat.quantities(AROUND.jet(t[shuffled], 2))["v"], found["v"][shuffled], rtol=1e-12)
+
+
+def test_limits_of_an_angle_that_turns_are_rejected():
+    flat = derived(CASES["unicycle"])
+    with pytest.raises(ValueError, match=r"th must stay within half a turn .*, got 12\.57 rad"):
+        cp.margins(AROUND, {"th": (-20.0, 11.0)}, flat)
+    assert cp.margins(AROUND, {"v": (0.0, 4.0)}, flat).active.value == pytest.approx(math.pi, rel=1e-3)
+    found = cp.margins(circle(0.3), {"th": 3.0}, flat)
+    assert found.active.value == pytest.approx(0.3 * math.tau, rel=1e-6)
