@@ -16,6 +16,9 @@ from ctrlplan.systems.derived_laws import references
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 
+_MOST_STEPS = 1_000_000
+"""Maximum number of steps of a horizon."""
+
 
 def create_flat_feedforward_iosystem(
     flat: FlatSystem,
@@ -133,7 +136,7 @@ def reference_window(
     dt : float
         Time between its samples [s], above 0.
     count : int
-        Number of steps.
+        Number of steps, at most 1,000,000.
     flat : FlatSystem, optional
         The plant.
     order : int, optional
@@ -163,7 +166,7 @@ def reference_window(
     ((3, 6), (1, 5), [1.9996, 1.9999, 2.0, 2.0, 2.0, 2.0])
     """
     check_kind(plan, "plan", Trajectory)
-    steps = checked_count(count, "count", 1)
+    steps = checked_count(count, "count", 1, _MOST_STEPS)
     begin, spacing = checked_finite(time, "time"), checked_finite(dt, "dt", above=0.0)
     times = begin + spacing * np.arange(steps + 1)
     if flat is None:
