@@ -539,3 +539,38 @@ def test_limits_of_an_angle_that_turns_are_rejected():
     assert cp.margins(AROUND, {"v": (0.0, 4.0)}, flat).active.value == pytest.approx(math.pi, rel=1e-3)
     found = cp.margins(circle(0.3), {"th": 3.0}, flat)
     assert found.active.value == pytest.approx(0.3 * math.tau, rel=1e-6)
+
+
+@pytest.mark.parametrize("orders", [(2, 1), (2, 2)])
+def test_optimal_control_of_python_control_on_equal_and_unequal_orders(orders):
+    """The plan begins at rest, obeys the equations and costs less than to stay."""
+    states = ["a", "va", "b", "vb"][: sum(orders)]
+    plant = ct.nlsys(
+        (lambda t, x, u, p: [x[1], u[0], u[1]]) if orders == (2, 1) else (lambda t, x, u, p: [x[1], u[0], x[3], u[1]]),
+        None,
+        states=states,
+        inputs=["ua", "ub"],
+        outputs=states,
+        name="axes",
+    )
+    flat = cp.flat_system(plant, ["a", "b"])
+    assert flat.orders == orders
+    end = np.array([1.0, 0.0, 2.0, 0.0])[: len(states)]
+    found = fs.solve_flat_optimal(
+        flat,
+        np.linspace(0.0, 2.0, 11),
+        np.zeros(len(states)),
+        np.zeros(2),
+        trajectory_cost=lambda x, u: u @ u,
+        terminal_cost=lambda x, u: 10.0 * (x - end) @ (x - end),
+        minimize_method="SLSQP",
+        basis=fs.PolyFamily(6),
+    )
+    x, u = found.eval(np.linspace(0.0, 2.0, 21))
+    np.testing.assert_allclose(np.concatenate([x[:, 0], u[:, 0]]), 0.0, atol=1e-9)
+    error = x[:, -1] - end
+    assert np.trapezoid((u**2).sum(axis=0), dx=0.1) + 10.0 * error @ error < 0.5 * 10.0 * end @ end
+    rates = np.array([plant.dynamics(0.0, *both) for both in zip(x.T, u.T, strict=True)]).T
+    t, h = np.linspace(0.0, 2.0, 21), 1e-4
+    slopes = (found.eval(t[1:-1] + h)[0] - found.eval(t[1:-1] - h)[0]) / (2.0 * h)
+    np.testing.assert_allclose(slopes, rates[:, 1:-1], atol=1e-6)

@@ -268,3 +268,40 @@ def test_a_law_of_measured_outputs_with_an_observer_of_python_control():
     free = np.concatenate([np.zeros(4), covariance.ravel(), np.zeros(4)])
     exact = cp.simulate(loop, np.linspace(0.0, 2.5, 26), initial_state=free, rtol=1e-9)
     np.testing.assert_allclose(exact.outputs["m2"], plan(exact.time), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_riccati_law_costs_no_more_than_gains_scheduled_on_speed():
+    """Terminal cost included, from a start off by 1 % of the move, along a bend on which the car accelerates.
+
+    Gains over speed are those of a straight line, in the frame of the car, as in
+    python-control's example of gain scheduling.
+    """
+    q, r, final = np.diag([1.0, 1.0, 10.0]), np.diag([1.0, 10.0]), np.diag([1.0, 1.0, 10.0])
+    ends = [(0.0, [0, 2, 0, 0], [0, 0, 0, 0]), (6.0, [40, 10, 0, 0], [8, 3, 0, 0])]
+    plan = cp.PolySpline([cp.Waypoint.from_jets(t, x=x, y=y) for t, x, y in ends])
+    speeds = np.linspace(1.0, 15.0, 29)
+    straight = [(np.array([[0, 0, 0], [0, 0, v], [0, 0, 0]]), np.array([[1, 0], [0, 0], [0, v / 3.0]])) for v in speeds]
+    gains = np.array([ct.lqr(*slopes, q, r)[0] for slopes in straight])
+
+    def scheduled(t, x, u, p):
+        states, inputs = CAR.states_and_inputs(plan, t)
+        c, s = np.cos(states[2]), np.sin(states[2])
+        frame = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        k = int(np.argmin(np.abs(speeds - inputs[0])))
+        return inputs - gains[k] @ frame @ (np.asarray(u) - states)
+
+    block = ct.nlsys(None, scheduled, inputs=CAR.state_labels, outputs=CAR.input_labels, name="law")
+    names = ["x", "y", "th", "v", "delta"]
+    theirs = ct.interconnect([block, car], inputs=0, outputs=names, name="scheduled")
+    start = CAR.states_and_inputs(plan, 0.0)[0] + [0.0, 0.4, 0.0]
+    ours = cp.flat_loop(CAR, plan, law=cp.TVLQR(q, r, final=final), initial_state=start)
+    t = np.linspace(0.0, 6.0, 601)
+    wanted = np.concatenate(CAR.states_and_inputs(plan, t))
+    costs = []
+    for loop in (ours, theirs):
+        found = cp.simulate(loop, t, initial_state=start)
+        e = np.array([found.outputs[name] for name in names]) - wanted
+        rates = np.einsum("it,ij,jt->t", e[:3], q, e[:3]) + np.einsum("it,ij,jt->t", e[3:], r, e[3:])
+        costs.append(np.trapezoid(rates, t) + e[:3, -1] @ final @ e[:3, -1])
+    assert costs[0] <= costs[1]
