@@ -228,6 +228,8 @@ class DerivedFlatSystem(FlatSystem):
     def quantities(self, jet: ArrayLike) -> dict[str, Array]:
         """States, inputs and outputs by name; see `FlatSystem`."""
         values, known = self._checked_jet(jet)
+        if not np.isfinite(values).all():
+            raise ValueError("jet must be finite, got nan or inf")
         below, _, last = rows_of(values, self.orders)
         p = self._values(self.params)
         trailing = below.shape[1:]
@@ -308,12 +310,21 @@ class DerivedFlatSystem(FlatSystem):
 
     def _forward(self, x: ArrayLike, u: ArrayLike, params: Mapping[str, float] | None = None) -> list[Array]:
         """Flags of states and constant inputs, all up to the highest order, as python-control requires."""
-        rows = self.maps.forward(np.asarray(x, dtype=float), np.asarray(u, dtype=float), self._values(params))
+        state, inputs = np.asarray(x, dtype=float), np.asarray(u, dtype=float)
+        if (state.shape[:1], inputs.shape[:1]) != ((self.nstates,), (self.ninputs,)):
+            raise ValueError(
+                f"x and u must be {self.nstates} states and {self.ninputs} inputs, got shapes {state.shape} and "
+                f"{inputs.shape}"
+            )
+        rows = self.maps.forward(state, inputs, self._values(params))
         return list(np.split(rows, len(self.orders)))
 
     def _reverse(self, flag: Sequence[ArrayLike], params: Mapping[str, float] | None = None) -> tuple[Array, Array]:
         """States and inputs of flags, connected with the operating point."""
         rows = [np.asarray(row, dtype=float) for row in flag]
+        if len(rows) != len(self.orders) or any(len(row) <= r for row, r in zip(rows, self.orders, strict=True)):
+            wanted = ", ".join(f"{r + 1} of {label}" for label, r in zip(self.flat_labels, self.orders, strict=True))
+            raise ValueError(f"flag must be {wanted} entries, got {', '.join(str(len(row)) for row in rows)}")
         below = np.concatenate([row[:r] for row, r in zip(rows, self.orders, strict=True)])
         last = np.stack([row[r] for row, r in zip(rows, self.orders, strict=True)])
         p = self._values(params)

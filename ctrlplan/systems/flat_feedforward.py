@@ -80,7 +80,7 @@ def create_flat_feedforward_iosystem(
     >>> cp.simulate(wanted, [0.0, 0.5, 1.0]).outputs[0].round(6).tolist()
     [0.0, 1.0, 2.0]
     """
-    check_kind(flat, "flat", FlatSystem)
+    check_kind(flat, "flat", FlatSystem, "a FlatSystem of ctrlplan, as ctrlplan.flat_system derives one")
     outputs = [f"xd[{k}]" for k in range(flat.nstates)] if states else []
     outputs += [f"ud[{k}]" for k in range(flat.ninputs)]
     if plan is not None:
@@ -171,7 +171,7 @@ def reference_window(
     times = begin + spacing * np.arange(steps + 1)
     if flat is None:
         return plan.jet(times, checked_count(order, "order"))
-    check_kind(flat, "flat", FlatSystem)
+    check_kind(flat, "flat", FlatSystem, "a FlatSystem of ctrlplan, as ctrlplan.flat_system derives one")
     x, u = flat.states_and_inputs(plan, times)
     return x, u[:, :-1]
 

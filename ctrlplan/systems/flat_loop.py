@@ -295,6 +295,7 @@ def flat_loop(
         name=f"{flat.name}_loop",
         ignore_outputs=unused,
     )
+    _check_limits(flat, axes, limits)
     first = flat.states_and_inputs(axes, plan.start)[0] if initial_state is None else initial_state
     own = traits_of(controller).initial_state if controller.nstates else None
     start = checked_vector(first, "initial_state", flat.nstates) if np.ndim(first) else _wrong_state(first, flat)
@@ -308,6 +309,24 @@ def _check_no_step(plan: Trajectory, flat: FlatSystem) -> None:
             f"plan must be continuous for a law of {flat.name}, got a step of {jump.label} by {jump.size:.4g} at "
             f"{jump.time:g} s; give a plan at rest at the goal, and initial_state= from which it is approached"
         )
+
+
+def _check_limits(flat: FlatSystem, plan: Trajectory, limits: InputLimits | None) -> None:
+    """Raise if an input with which the plant rests at an end of the plan is beyond its limits."""
+    bounds = input_bounds(limits, flat)
+    if bounds is None:
+        return
+    for time in (plan.start, plan.end):
+        if plan.jet(time, 2)[1:].any():
+            continue
+        u = flat.states_and_inputs(plan, time)[1]
+        slack = 1e-9 * np.abs(u)
+        for name, value, low, high, room in zip(flat.input_labels, u, *bounds, slack, strict=True):
+            if not low - room <= value <= high + room:
+                raise ValueError(
+                    f"limits[{name!r}] must contain the input with which {flat.name} is at rest at {time:g} s, "
+                    f"{value:.6g}, got {low:g} to {high:g}"
+                )
 
 
 def _own(flat: fs.FlatSystem) -> FlatSystem:

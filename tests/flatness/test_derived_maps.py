@@ -574,3 +574,14 @@ def test_optimal_control_of_python_control_on_equal_and_unequal_orders(orders):
     t, h = np.linspace(0.0, 2.0, 21), 1e-4
     slopes = (found.eval(t[1:-1] + h)[0] - found.eval(t[1:-1] - h)[0]) / (2.0 * h)
     np.testing.assert_allclose(slopes, rates[:, 1:-1], atol=1e-6)
+
+
+def test_flags_states_and_jets_of_wrong_sizes():
+    flat = derived(CASES["crane"])
+    for flag in ([np.zeros(3), np.zeros(5)], [np.zeros(5)]):
+        with pytest.raises(ValueError, match="flag must be 5 of x, 5 of z entries, got"):
+            flat.reverse(flag)
+    with pytest.raises(ValueError, match=r"x and u must be 6 states and 2 inputs, got shapes \(3,\)"):
+        flat.forward(np.zeros(3), np.zeros(2))
+    with pytest.raises(ValueError, match="jet must be finite"):
+        flat.quantities(np.full((5, 2, 3), np.nan))

@@ -333,3 +333,27 @@ def test_blocks_that_cannot_be_traced_are_named_with_the_line(update, line):
     plant = ct.nlsys(update, None, states=["x"], inputs=["u"], name="plant")
     with pytest.raises(ValueError, match=f"block plant cannot be .*{line}"):
         cp.flat_system(plant, "x")
+
+
+@pytest.mark.parametrize(
+    ("outputs", "reason"),
+    [
+        (lambda x, u, p: [x[9]], r"IndexError: .*, in test_structure\.py, line \d+"),
+        (lambda x, u, p: [math.sin(x[0])], r"TypeError: .* line \d+: \(lambda x, u, p: \[math"),
+        (lambda x, u: [x[0]], r"takes 2 positional arguments but 3 were given$"),
+        (lambda x, u, p: None, r"'NoneType'$"),
+    ],
+)
+def test_functions_of_flat_outputs_that_fail_are_named_with_the_line(outputs, reason):
+    with pytest.raises(TypeError, match=rf"flat_outputs must be a function h\(x, u, params\) .*{reason}"):
+        cp.flat_system(two_mass(0.0), outputs)
+
+
+def test_parameters_that_are_no_numbers_and_systems_without_states():
+    plant = ct.nlsys(lambda t, x, u, p: [u[0] / p["m"]], None, states=["v"], inputs=["F"], params={"m": 2.0}, name="p")
+    with pytest.raises(ValueError, match=r"params\['m'\] must be finite, got nan"):
+        cp.flat_system(plant, "v", params={"m": np.nan})
+    with pytest.raises(ValueError, match="finite"):
+        cp.flat_system(plant, "v", params={"m": 0.0})
+    with pytest.raises(ValueError, match="system must have states and inputs, got 0 and 1"):
+        cp.flat_system(ct.ss([], [], [], [[1.0]]))
