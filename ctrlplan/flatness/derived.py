@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from copy import copy
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -64,7 +63,7 @@ class DerivedFlatSystem(FlatSystem):
         self,
         maps: FlatMaps,
         equations: tuple[Tape, Tape, Tape, Tape],
-        analysis: Analysis,
+        analysis: Analysis | None,
         *,
         flat_labels: Sequence[str],
         states: Sequence[str],
@@ -92,7 +91,7 @@ class DerivedFlatSystem(FlatSystem):
         )
         self.maps = maps
         self._outputs, self._flat, self._slopes = measured, flat, slopes
-        self._analysis: Analysis | None = analysis
+        self._equations, self._analysis = equations, analysis
         self.operating_point = dict(operating_point)
         self.notes = tuple(notes)
         self._plans: Lru[int, tuple[Trajectory, Trajectory]] = Lru(8)
@@ -136,12 +135,19 @@ class DerivedFlatSystem(FlatSystem):
         ValueError
             If a name is unknown, or a value is not finite.
         """
-        values = self._values(params).tolist()
-        found = copy(self)
-        found.params = dict(zip(self._names, values, strict=True))
-        found._current_params = dict(found.params)
-        found.forward, found.reverse = found._forward, found._reverse
-        return found
+        return DerivedFlatSystem(
+            self.maps,
+            self._equations,
+            self._analysis,
+            flat_labels=self.flat_labels,
+            states=self.state_labels,
+            inputs=self.input_labels,
+            outputs=self.output_labels,
+            operating_point=self.operating_point,
+            params=dict(zip(self._names, self._values(params).tolist(), strict=True)),
+            notes=self.notes,
+            name=str(self.name),
+        )
 
     def _describe(self) -> Iterator[Part]:
         yield from super()._describe()
@@ -201,7 +207,7 @@ class DerivedFlatSystem(FlatSystem):
         return self.extended_along(plan, time)[self.maps.nstates :, 0]
 
     def extended_along(self, plan: Trajectory, timepts: ArrayLike) -> Array:
-        """States of the plant and of the extension (nstates + extension, ntime) along a plan."""
+        """States (nstates + extension, ntime) of the extended plant."""
         plan, times = self._folded(*self._along(plan, timepts, None))
         p, jet = self.parameter_values(), plan.jet(times.ravel(), max(self.orders))
         z, u = states_along(self.maps, self._grid(plan, p, None), jet, times.ravel(), p, str(self.name))
@@ -265,9 +271,10 @@ class DerivedFlatSystem(FlatSystem):
         return plan.plan, plan.first_pass(times.ravel()).reshape(times.shape)
 
     def check_limits(self, plan: Trajectory, names: Set[str]) -> None:
-        """Raise if an angle is to be limited that a plan turns by more than half a turn from the operating point.
+        """Raise for limits of angles that turn too far along a plan.
 
-        A jet does not state the number of turns.
+        A jet does not state the number of turns: an angle must stay within half a turn
+        of the operating point.
 
         Parameters
         ----------
