@@ -504,15 +504,16 @@ def test_other_values_of_parameters():
 
 @pytest.mark.slow
 def test_margins_over_ranges_of_parameters():
-    flat = cp.flat_system(cp.plants.Crane().iosystem(), ["x", "z"], at={"R": 10.0})
-    plan = rest_to_rest(["x", "z"], [4, 4], [20.0, 11.0], 15.0, [0.0, 10.0])
-    limits, params = {"C": (-1500.0, 0.0)}, {"load_mass": (400.0, 600.0), "gravity": 9.81}
-    found = cp.margins(plan, limits, flat, params=params)
-    known = cp.margins(plan, limits, cp.plants.Crane(), params=params)
-    assert found.active.parameters == {"load_mass": 600.0}
-    assert found.active.fraction == pytest.approx(known.active.fraction, rel=1e-8)
+    """A mass with a force: the largest mass is the worst; the quintic move has the peak acceleration 10/sqrt(3)."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: [x[1], u[0] / p["m"]], None, states=["x", "v"], inputs=["F"], params={"m": 2.0}, name="mass"
+    )
+    flat, plan = cp.flat_system(plant, "x"), rest_to_rest(["x"], [2], [1.0], 1.0)
+    found = cp.margins(plan, {"F": 20.0}, flat, params={"m": (1.0, 3.0)})
+    assert found.active.parameters == {"m": 3.0}
+    assert abs(found.active.value) == pytest.approx(3.0 * 10.0 / math.sqrt(3.0), rel=1e-8)
     with pytest.raises(ValueError, match="params must be among"):
-        cp.margins(plan, limits, flat, params={"load": 1.0})
+        cp.margins(plan, {"F": 20.0}, flat, params={"mass": 1.0})
 
 
 @pytest.mark.parametrize("count", [7, 401])

@@ -357,3 +357,19 @@ def test_parameters_that_are_no_numbers_and_systems_without_states():
         cp.flat_system(plant, "v", params={"m": 0.0})
     with pytest.raises(ValueError, match="system must have states and inputs, got 0 and 1"):
         cp.flat_system(ct.ss([], [], [], [[1.0]]))
+
+
+def test_smooth_functions_take_the_place_of_operations_at_their_kink():
+    """A vehicle under water with quadratic drag that begins at rest, as the error says."""
+
+    def plant(size):
+        return system("diver", "x v", "F", lambda x, v, F: [v, (F - 30.0 * v * size(v)) / 50.0])
+
+    with pytest.raises(ValueError, match=r"abs of v at 0; .*, such as np\.sqrt\(x\*\*2 \+ d\*\*2\) for abs"):
+        cp.flat_system(plant(np.abs), "x")
+    flat = cp.flat_system(plant(lambda v: np.sqrt(v**2 + 1e-8)), "x")
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0), cp.Waypoint(4, 0, 0, 0)], labels="x")
+    t = np.linspace(0.0, 4.0, 41)
+    _, v, a = plan.jet(t, 2)[:, 0]
+    _, force = flat.states_and_inputs(plan, t)
+    np.testing.assert_allclose(force[0], 50.0 * a + 30.0 * v * np.sqrt(v**2 + 1e-8), atol=1e-10)

@@ -305,3 +305,29 @@ def test_riccati_law_costs_no_more_than_gains_scheduled_on_speed():
         rates = np.einsum("it,ij,jt->t", e[:3], q, e[:3]) + np.einsum("it,ij,jt->t", e[3:], r, e[3:])
         costs.append(np.trapezoid(rates, t) + e[:3, -1] @ final @ e[:3, -1])
     assert costs[0] <= costs[1]
+
+
+@pytest.mark.slow
+def test_payloads_in_a_monte_carlo():
+    """Draws of the payload are parameters of the plant, not of the law, which has no integral action here."""
+    rest = [0.0] * 4
+    ends = [(0.0, [0.0, *rest], [10.0, *rest]), (8.0, [6.0, *rest], [11.0, *rest])]
+    plan = cp.PolySpline([cp.Waypoint.from_jets(t, x=x, z=z) for t, x, z in ends])
+    flat = cp.flat_system(cp.plants.Crane().iosystem(), ["x", "z"], at={"R": 10.0})
+
+    def loop(name, plan):
+        return cp.flat_loop(flat, plan, poles=[FAST, FAST])
+
+    found = cp.monte_carlo(
+        loop,
+        {"load_mass": np.array([490.0, 500.0, 510.0])},
+        {"plan": plan},
+        np.linspace(0.0, 12.0, 61),
+        outputs=["x", "z"],
+        controls=["F", "C"],
+        progress=False,
+    )
+    assert found.finished == 3
+    assert not found.failures
+    errors = found.metrics["plan"]["iae_z"]
+    assert errors[1] < 1e-6 < 0.1 < min(errors[0], errors[2])
