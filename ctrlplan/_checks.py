@@ -179,15 +179,15 @@ def checked_limits(limits: object, name: str) -> tuple[float, float, float]:
     return low, high, abs(low if math.isfinite(low) else high) or 1.0
 
 
-def checked_count(value: float | Real, name: str, minimum: int = 0) -> int:
-    """Integer of at least a minimum."""
+def checked_count(value: float | Real, name: str, minimum: int = 0, maximum: int = MAXIMUM) -> int:
+    """Integer between a minimum and a maximum."""
     if not isinstance(value, Real):
         raise TypeError(f"{name} must be an integer of at least {minimum}, got {value!r}")
     number = one_number(value, name, f"an integer of at least {minimum}")
     if not math.isfinite(number) or number != int(number) or number < minimum:
         raise ValueError(f"{name} must be an integer of at least {minimum}, got {value}")
-    if number > MAXIMUM:
-        raise ValueError(f"{name} must be at most {MAXIMUM}, got {value}")
+    if number > maximum:
+        raise ValueError(f"{name} must be at most {maximum}, got {value}")
     return int(number)
 
 

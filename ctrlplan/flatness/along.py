@@ -36,9 +36,6 @@ _MINIMA = 8
 _DETOUR = 200
 """Maximum number of steps along one side of a detour."""
 
-_DENSE = 64
-"""Number of flags in a sequence from which on straight lines between neighbours are sufficient."""
-
 _DEEPEST = 24
 """Number of halvings of an interval."""
 
@@ -150,14 +147,13 @@ def connected(maps: FlatMaps, flag: Array, p: Array, start: Array | None, name: 
     return _connected(maps, flag, p, z, max(maps.orders), _DETOUR, f"{name}{_when(time)}")
 
 
-def connected_with_neighbour(maps: FlatMaps, flag: Array, p: Array, z: Array, name: str, count: int) -> Array:
-    """State of a flag, connected with that of the flag before it in a sequence of `count`.
+def connected_with_neighbour(maps: FlatMaps, flag: Array, p: Array, z: Array, name: str) -> Array:
+    """State of a flag, connected with that of the flag before it in a sequence.
 
-    Detours are tried in sequences of few flags only, in first derivatives: many flags
-    are near each other, and plans that are infeasible for the plant are tried in
-    large numbers.
+    Detours are tried in first derivatives only, and given up early: sequences of
+    plans that are infeasible for the plant are tried in large numbers.
     """
-    return _connected(maps, flag, p, z, 2 if count < _DENSE else 0, _DETOUR // 5, name)
+    return _connected(maps, flag, p, z, 2, _DETOUR // 5, name)
 
 
 def _connected(maps: FlatMaps, flag: Array, p: Array, z: Array, orders: int, trials: int, name: str) -> Array:

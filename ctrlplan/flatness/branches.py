@@ -105,7 +105,8 @@ class _Tracer:
         if not abs(value) > 0.0:  # also nan
             raise ValueError(
                 f"operating point of {self.name} must be on one side of each operation that is not smooth, got "
-                f"{operation} of {_short(shown)} at {value:g}; give values of states or inputs by at="
+                f"{operation} of {_short(shown)} at {value:g}; give values of states or inputs by at= or, for plans on "
+                "both sides, equations with a smooth function in its place, such as np.sqrt(x**2 + d**2) for abs(x)"
             )
         self.sides.append(argument if value > 0.0 else -argument)
         self.notes.append(f"{operation} of {_short(shown)}, {'positive' if value > 0.0 else 'negative'}")

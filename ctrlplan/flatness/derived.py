@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import copy
-from functools import partial
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_finite
 from ctrlplan._display import Facts, Part
@@ -41,6 +41,10 @@ _PERIODIC = 1e-6
 """Difference of states one period apart, relative to their size, that is attributed to rounding."""
 
 
+_TURN_SAMPLES = 401
+"""Times at which angles along a plan are evaluated."""
+
+
 class DerivedFlatSystem(FlatSystem):
     """Flat system whose maps follow from its equations.
 
@@ -61,7 +65,7 @@ class DerivedFlatSystem(FlatSystem):
         self,
         maps: FlatMaps,
         equations: tuple[Tape, Tape, Tape, Tape],
-        analysis: Analysis,
+        analysis: Analysis | None,
         *,
         flat_labels: Sequence[str],
         states: Sequence[str],
@@ -89,7 +93,7 @@ class DerivedFlatSystem(FlatSystem):
         )
         self.maps = maps
         self._outputs, self._flat, self._slopes = measured, flat, slopes
-        self._analysis: Analysis | None = analysis
+        self._equations, self._analysis = equations, analysis
         self.operating_point = dict(operating_point)
         self.notes = tuple(notes)
         self._plans: Lru[int, tuple[Trajectory, Trajectory]] = Lru(8)
@@ -133,12 +137,19 @@ class DerivedFlatSystem(FlatSystem):
         ValueError
             If a name is unknown, or a value is not finite.
         """
-        values = self._values(params).tolist()
-        found = copy(self)
-        found.params = dict(zip(self._names, values, strict=True))
-        found._current_params = dict(found.params)
-        found.forward, found.reverse = found._forward, found._reverse
-        return found
+        return DerivedFlatSystem(
+            self.maps,
+            self._equations,
+            self._analysis,
+            flat_labels=self.flat_labels,
+            states=self.state_labels,
+            inputs=self.input_labels,
+            outputs=self.output_labels,
+            operating_point=self.operating_point,
+            params=dict(zip(self._names, self._values(params).tolist(), strict=True)),
+            notes=self.notes,
+            name=str(self.name),
+        )
 
     def _describe(self) -> Iterator[Part]:
         yield from super()._describe()
@@ -195,11 +206,15 @@ class DerivedFlatSystem(FlatSystem):
 
     def extension_along(self, plan: Trajectory, time: float) -> Array:
         """States of the extension (extension,) at a time of a plan."""
-        plan, times = self._folded(*self._along(plan, time, None))
+        return self.extended_along(plan, time)[self.maps.nstates :, 0]
+
+    def extended_along(self, plan: Trajectory, timepts: ArrayLike) -> Array:
+        """States (nstates + extension, ntime) of the extended plant."""
+        plan, times = self._folded(*self._along(plan, timepts, None))
         p, jet = self.parameter_values(), plan.jet(times.ravel(), max(self.orders))
         z, u = states_along(self.maps, self._grid(plan, p, None), jet, times.ravel(), p, str(self.name))
         self._check_determined(z[: self.maps.nstates], u, plan, times.ravel())
-        return z[self.maps.nstates :, 0]
+        return z
 
     def linearised(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
         """Jacobians of the rates.
@@ -221,6 +236,8 @@ class DerivedFlatSystem(FlatSystem):
     def quantities(self, jet: ArrayLike) -> dict[str, Array]:
         """States, inputs and outputs by name; see `FlatSystem`."""
         values, known = self._checked_jet(jet)
+        if not np.isfinite(values).all():
+            raise ValueError("jet must be finite, got nan or inf")
         below, _, last = rows_of(values, self.orders)
         p = self._values(self.params)
         trailing = below.shape[1:]
@@ -255,6 +272,33 @@ class DerivedFlatSystem(FlatSystem):
             check_end(plan, f"a plan along which states of {self.name} are not periodic")
         return plan.plan, plan.first_pass(times.ravel()).reshape(times.shape)
 
+    def check_limits(self, plan: Trajectory, names: Set[str]) -> None:
+        """Raise for limits of angles that turn too far along a plan.
+
+        A jet does not state the number of turns: an angle must stay within half a turn
+        of the operating point.
+
+        Parameters
+        ----------
+        plan : Trajectory
+            Plan of the flat outputs.
+        names : set of str
+            Limited signals.
+        """
+        angles = zip(self.state_labels, self._angles[: self.maps.nstates].tolist(), strict=True)
+        limited = [k for k, (name, is_angle) in enumerate(angles) if is_angle and name in names]
+        if not limited:
+            return
+        x = self.states_and_inputs(plan, np.linspace(plan.start, plan.end, _TURN_SAMPLES))[0]
+        turned = np.abs(x - self.maps.start[: self.maps.nstates, None]).max(axis=1)
+        for k in limited:
+            if turned[k] >= math.pi:
+                raise ValueError(
+                    f"{self.state_labels[k]} must stay within half a turn of the operating point to be limited, got "
+                    f"{turned[k]:.4g} rad; limit the parts of the plan one by one with at= for each, or evaluate "
+                    "states_and_inputs"
+                )
+
     def _grid(self, plan: Trajectory, p: Array, start: Array | None) -> Grid:
         """Grid of a plan, kept for the next call."""
         key = (id(plan), p.tobytes(), b"" if start is None else start.tobytes())
@@ -275,12 +319,21 @@ class DerivedFlatSystem(FlatSystem):
 
     def _forward(self, x: ArrayLike, u: ArrayLike, params: Mapping[str, float] | None = None) -> list[Array]:
         """Flags of states and constant inputs, all up to the highest order, as python-control requires."""
-        rows = self.maps.forward(np.asarray(x, dtype=float), np.asarray(u, dtype=float), self._values(params))
+        state, inputs = np.asarray(x, dtype=float), np.asarray(u, dtype=float)
+        if (state.shape[:1], inputs.shape[:1]) != ((self.nstates,), (self.ninputs,)):
+            raise ValueError(
+                f"x and u must be {self.nstates} states and {self.ninputs} inputs, got shapes {state.shape} and "
+                f"{inputs.shape}"
+            )
+        rows = self.maps.forward(state, inputs, self._values(params))
         return list(np.split(rows, len(self.orders)))
 
     def _reverse(self, flag: Sequence[ArrayLike], params: Mapping[str, float] | None = None) -> tuple[Array, Array]:
         """States and inputs of flags, connected with the operating point."""
         rows = [np.asarray(row, dtype=float) for row in flag]
+        if len(rows) != len(self.orders) or any(len(row) <= r for row, r in zip(rows, self.orders, strict=True)):
+            wanted = ", ".join(f"{r + 1} of {label}" for label, r in zip(self.flat_labels, self.orders, strict=True))
+            raise ValueError(f"flag must be {wanted} entries, got {', '.join(str(len(row)) for row in rows)}")
         below = np.concatenate([row[:r] for row, r in zip(rows, self.orders, strict=True)])
         last = np.stack([row[r] for row, r in zip(rows, self.orders, strict=True)])
         p = self._values(params)
@@ -291,12 +344,16 @@ class DerivedFlatSystem(FlatSystem):
         return z[: self.maps.nstates].reshape(-1, *trailing), u.reshape(-1, *trailing)
 
     def _states(self, flags: Array, p: Array) -> Array:
-        """Extended states (nz, n) of flags (nz, n): the first from the operating point, then neighbour by neighbour."""
+        """Extended states (nz, n) of flags (nz, n): the first from the operating point, then neighbour by neighbour.
+
+        Angles are continuous from each flag to the next.
+        """
         maps = self.maps
         z = np.full(flags.shape, np.nan)
         near, left = maps.start, np.arange(flags.shape[1])
         while left.size:
             trial, found = maps.refined(np.repeat(near[:, None], left.size, axis=1), flags[:, left], p)
+            found &= maps.same_side(trial, p)
             # At rest a state may be one of many with the same flag.
             for j in np.flatnonzero(found & at_rest(maps.orders, flags[:, left])):
                 found[j] = self._is_regular(trial[:, j], p)
@@ -306,13 +363,14 @@ class DerivedFlatSystem(FlatSystem):
                 k = int(left[0])
                 try:
                     if k:
-                        near = connected_with_neighbour(maps, flags[:, k], p, near, str(self.name), flags.shape[1])
+                        near = connected_with_neighbour(maps, flags[:, k], p, z[:, k - 1], str(self.name))
                     else:
                         near = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
                 except ValueError as error:
                     raise ValueError(f"{error}{note_of_still(maps.orders, flags[:, k])}") from None
                 z[:, k] = near
                 left = left[1:]
+        z[self._angles] = np.unwrap(z[self._angles])
         return z
 
     def _is_regular(self, z: Array, p: Array) -> bool:
@@ -320,6 +378,11 @@ class DerivedFlatSystem(FlatSystem):
         maps = self.maps
         peaks = np.abs(maps.slopes(maps.start, p) * maps.scales).max(axis=1)
         return regularity(maps.slopes(z, p) * maps.scales, peaks) >= SINGULAR
+
+    @cached_property
+    def _angles(self) -> NDArray[np.bool_]:
+        """States of the extended plant that are angles."""
+        return self.maps.angles(self.parameter_values())
 
     def _extended(self, state: Array, plan: Trajectory, p: Array) -> Array:
         """Extended state at the start of a plan for a given state of the plant."""

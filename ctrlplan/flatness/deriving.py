@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from numbers import Real
 from typing import TYPE_CHECKING
 
 import control as ct
 import numpy as np
 
-from ctrlplan._checks import check_kind
+from ctrlplan._checks import check_kind, checked_finite
 from ctrlplan._types import Array, Params, System
 from ctrlplan.flatness.derived import DerivedFlatSystem
 from ctrlplan.flatness.errors import NotFlatError
@@ -109,6 +110,9 @@ def flat_system(
     from ctrlplan.flatness.analysis import analysed
 
     plant = _state_space(system)
+    for key, value in dict(params or {}).items():
+        if isinstance(value, Real):
+            checked_finite(value, f"params[{key!r}]")
 
     def derived(outputs: FlatOutputs) -> DerivedFlatSystem:
         analysis, original = analysed(
@@ -186,6 +190,8 @@ def _rows(system: System, inputs: Sequence[str] | str | None) -> Array:
             "flat_outputs must be given for a nonlinear system: names of outputs or states, or a function h(x, u, "
             "params); see flat_candidates"
         )
+    if not system.nstates:
+        raise ValueError(f"system must have states and inputs, got 0 and {system.ninputs} of {system.name}")
     chosen = list(system.input_labels) if inputs is None else [inputs] if isinstance(inputs, str) else list(inputs)
     return brunovsky_outputs(
         system, [list(system.input_labels).index(label) for label in chosen if label in system.input_labels]

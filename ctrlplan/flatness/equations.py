@@ -13,7 +13,7 @@ import numpy as np
 from ctrlplan._checks import check_signals, checked_names, default_labels
 from ctrlplan._types import Array, BlockMap, Params, System, Value
 from ctrlplan.symbolic.symbols import Symbol, column_of, symbol_array
-from ctrlplan.symbolic.tracing import Trace, traced
+from ctrlplan.symbolic.tracing import Trace, described, traced
 from ctrlplan.traits import traits_of
 
 FlatOutputs = Sequence[str] | str | Callable[..., Value]
@@ -153,7 +153,13 @@ def _flat(
 ) -> tuple[tuple[str, ...], ca.SX]:
     """Names and expressions of the flat outputs."""
     if callable(flat_outputs):
-        column = column_of(flat_outputs(symbol_array(x), symbol_array(u), params))
+        try:
+            column = column_of(flat_outputs(symbol_array(x), symbol_array(u), params))
+        except Exception as error:  # any exception of the user's function
+            raise TypeError(
+                f"flat_outputs must be a function h(x, u, params) of functions of numpy that returns the flat outputs, "
+                f"got {described(error)}"
+            ) from error
         return _labels(system, column, x, u, outputs), column
     names = tuple(checked_names(flat_outputs, "flat_outputs"))
     known = dict(zip(system.state_labels, ca.vertsplit(x), strict=True))

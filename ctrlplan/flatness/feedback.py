@@ -162,6 +162,30 @@ def _errors(analysis: Analysis, reference: _Reference) -> ca.SX:
     return analysis.equations.flat - ca.vertcat(*(row[0] for row in reference.rows))
 
 
+def check_law_along(analysis: Analysis, z: Array, times: Array, name: str) -> None:
+    """Raise if a law without states is nearly singular at states (nz, n) of the extended plant along a plan.
+
+    Raises
+    ------
+    ValueError
+        With the time at which the influence of the extension on the outputs that
+        determine it is below 0.1 of its maximum, or has another sign.
+    """
+    structure = analysis.structure
+    for entry, rows in zip(structure.rounds, _closed(analysis, name)[1], strict=True):
+        tape = tape_of((structure.z, structure.p), entry.matrix[rows, :], matrix=True)
+        matrices = np.broadcast_to(tape(z, analysis.equations.values[:, None]), (len(rows), len(rows), times.size))
+        found = np.linalg.det(np.moveaxis(matrices, -1, 0))
+        share = found / found[np.argmax(np.abs(found))]
+        k = int(np.argmin(share))
+        if share[k] < _REGULAR:
+            raise ValueError(
+                f"quasi_static must be False for this plan of {name}: the states of its extension are determined too "
+                f"weakly at {times[k]:.6g} s, by {share[k]:.3g} of the maximum along the plan instead of at least "
+                f"{_REGULAR:g}; use the law with states, or at= with a state of the plan in flat_system"
+            )
+
+
 def _tapes(
     analysis: Analysis, reference: _Reference, u: ca.SX, rates: ca.SX, counts: tuple[int, ...], extension: int
 ) -> LawExpressions:

@@ -37,6 +37,16 @@ class LinearMaps(NamedTuple):
     inputs: Array  # (1, n + 1), as functions of z, ..., z^(n): a_0, ..., a_(n - 1), 1
     output: Array  # (n + 1,), as a function of z, ..., z^(n)
 
+    @property
+    def has_zeros(self) -> bool:
+        """Whether the output depends on derivatives of the flat output."""
+        return bool(self.output[1:].any())
+
+    def of_output(self) -> LinearMaps:
+        """Maps with the output in place of the flat output, of which it is a multiple."""
+        gain = float(self.output[0])
+        return LinearMaps(gain * self.flag, self.states / gain, self.inputs / gain, self.output / gain)
+
     def forward(self, x: Value, u: Value) -> list[Value]:
         """Flag of a state and an input."""
         return [self.flag @ np.concatenate([x, u])]

@@ -5,6 +5,7 @@ Evaluated by numpy for arrays of flags, without CasADi.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -104,6 +105,21 @@ class FlatMaps:
     mu_scales: Array
     affine: bool
 
+    def angles(self, p: Array) -> NDArray[np.bool_]:
+        """States of which multiples of 2 pi have no effect on flags and controls, (nz,)."""
+
+        def values(at: Array) -> Array:
+            mu = np.broadcast_to(self.mu[:, None], (self.mu.size, at.shape[1]))
+            rows = self.flags(at, p), self.last(at, mu, p), self.controls(at, mu, p)
+            return np.concatenate([row.reshape(-1, at.shape[1]) for row in rows])
+
+        shift = 0.1 * self.scales * np.random.default_rng(5).uniform(-1.0, 1.0, self.start.size)
+        z = (self.start + shift)[:, None]
+        with np.errstate(all="ignore"):
+            known, turned = values(z), values(z + math.tau * np.eye(self.start.size))
+        size = np.maximum(np.abs(known), 1e-9 * np.abs(known).max(initial=1e-300))
+        return np.asarray((np.abs(turned - known) <= 1e-9 * size).all(axis=0))
+
     def flag_of(self, z: Array, p: Array) -> Array:
         """Flags without their last entries, (nz, ...)."""
         return self.flags(z, p)
@@ -179,6 +195,15 @@ class FlatMaps:
                 before = size
             found = np.isfinite(size) & (size < 1e-9) & near
         return z, found
+
+    def same_side(self, z: Array, p: Array) -> NDArray[np.bool_]:
+        """Whether the slopes at states (nz, n) have the orientation of those at the start, or are singular.
+
+        The orientation does not change along paths without singular points.
+        """
+        with np.errstate(all="ignore"):
+            signs = np.linalg.slogdet(np.moveaxis(self.slopes(z, p), -1, 0))[0]
+        return np.asarray(signs != -np.linalg.slogdet(self.slopes(self.start, p))[0])
 
     def followed(
         self,
@@ -268,6 +293,15 @@ class FlatMaps:
     def _singular(self, z: Array, place: float, p: Array) -> SingularError:
         """Error that names the entry of z that is not determined."""
         return SingularError(f"{self.weakest(z, p)} is not determined by the flat outputs there", place)
+
+    def is_regular(self, z: Array, p: Array) -> bool:
+        """Whether a state is determined by its flags, and the controls by the highest derivatives, as at the start."""
+
+        def matrices(at: Array) -> tuple[Array, Array]:
+            return self.slopes(at, p) * self.scales, self.last(at, self.mu, p)[:, 1:] * self.mu_scales
+
+        pairs = zip(matrices(self.start), matrices(z), strict=True)
+        return all(regularity(b, np.abs(a).max(axis=1)) > 1e-6 * regularity(a) for a, b in pairs)
 
     def weakest(self, z: Array, p: Array) -> str:
         """Name of the entry of z that the flags determine worst."""

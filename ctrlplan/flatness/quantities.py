@@ -14,7 +14,7 @@ from ctrlplan._types import Array, Params
 from ctrlplan.flatness.on_path import PathTable
 from ctrlplan.flatness.rest import AT_REST
 from ctrlplan.flatness.system import FlatSystem
-from ctrlplan.flatness.verify import check_maps, checked_plant, random_probes, undetermined_at_rest, warn_of_output
+from ctrlplan.flatness.verify import check_maps, check_output, checked_plant, random_probes, undetermined_at_rest
 from ctrlplan.trajectories import PathPlan
 
 
@@ -54,26 +54,21 @@ def quantities_of_flat_system(flat_system: fs.FlatSystem) -> Callable[[Array], d
         If `flat_system` is not a `control.flatsys.FlatSystem`.
     ValueError
         If it is in discrete time, or `forward`, `reverse` and the equations of
-        motion are inconsistent; by the returned function, if the jet is too short
-        or has another number of axes.
-
-    Warns
-    -----
-    UserWarning
-        If it is a `LinearFlatSystem` whose output is not its flat output, but a
-        multiple of it or, if the plant has zeros, a linear combination of its
-        derivatives.
+        motion are inconsistent; if it is a `LinearFlatSystem` with zeros, whose
+        output is not a flat output; by the returned function, if the jet is too
+        short or has another number of axes.
 
     Notes
     -----
-    States and inputs that the flat output does not determine at rest (heading and
+    The flat output of a `LinearFlatSystem` is its output, of which that of
+    python-control is a multiple. States and inputs that the flat output does not determine at rest (heading and
     steering angle of a car, quotients of derivatives that are 0 there) are nan
     at rest.
     """
     if isinstance(flat_system, FlatSystem):
         return flat_system.quantities
     plant = checked_plant(flat_system)
-    warn_of_output(flat_system)
+    check_output(flat_system)
     check_maps(flat_system)
     states, inputs = list(flat_system.state_labels), list(flat_system.input_labels)
     # Not at zero, where some flags are not finite.
@@ -154,7 +149,7 @@ class QuantitiesOnPath:
 def _vectorised(flat_system: fs.FlatSystem) -> FlatSystem:
     """Flat system of python-control with vectorised maps."""
     plant = checked_plant(flat_system)
-    warn_of_output(flat_system)
+    check_output(flat_system)
     check_maps(flat_system)
     orders = random_probes(plant)[0].orders
 

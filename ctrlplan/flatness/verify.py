@@ -6,7 +6,6 @@ from `reverse`.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -15,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_labels, default_labels
-from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params, System, Value
 from ctrlplan.flatness.linear import LinearMaps, is_linear, linear_maps
 from ctrlplan.trajectories import derivative_name
@@ -67,7 +65,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class _LinearPlant(FlatPlant):
-    """A linear flat system with maps correct to rounding."""
+    """A linear flat system with maps correct to rounding; its output is the flat output unless it has zeros."""
 
     maps: LinearMaps
 
@@ -88,7 +86,8 @@ def checked_plant(flat_system: System, label: str = "flat_system") -> FlatPlant:
     if not (n and m):
         raise ValueError(f"{label} must have states and inputs, got {n} and {m}")
     if is_linear(flat_system):
-        return _LinearPlant(flat_system, n, m, {}, linear_maps(flat_system))
+        maps = linear_maps(flat_system)
+        return _LinearPlant(flat_system, n, m, {}, maps if maps.has_zeros else maps.of_output())
     return FlatPlant(flat_system, n, m, dict(flat_system.params))
 
 
@@ -115,29 +114,22 @@ def check_maps(flat_system: fs.FlatSystem) -> None:
         _check_reverse(plant, probe, names, sizes)
 
 
-def warn_of_output(flat_system: fs.FlatSystem) -> None:
-    """Warn if the flat output of a linear system, as python-control defines it, is not its output."""
+def check_output(flat_system: fs.FlatSystem) -> None:
+    """Raise for a linear system with zeros, whose flat output, as python-control defines it, is not its output."""
     if not is_linear(flat_system):
         return
-    coefficients = linear_maps(flat_system).output
-    name, chosen = flat_system.output_labels[0], f"the flat output of {flat_system.name} is not its output"
-    gain = float(coefficients[0])
-    if not coefficients[1:].any():
-        if abs(gain - 1.0) > _SAME:
-            warnings.warn(
-                f"{chosen}, but {name} is {gain:.6g} times the flat output: multiply a plan of {name} by "
-                f"{1.0 / gain:.6g}, or use a control.flatsys.FlatSystem with the flat output {name}",
-                stacklevel=outside_stacklevel(),
-            )
+    maps = linear_maps(flat_system)
+    if not maps.has_zeros:
         return
-    terms = [f"{value:.6g} {derivative_name('z', k)}" for k, value in enumerate(coefficients.tolist()) if value]
-    at_rest = f"at rest {name} is 0"
-    if gain:
-        at_rest = f"at rest z is {name} times {1.0 / gain:.6g}"
-    warnings.warn(
-        f"{chosen}, since the plant has zeros: {name} = {' + '.join(terms)}, z the flat output. A plan is one of z, "
-        f"not of {name}; {at_rest}, and in motion {name} depends on the derivatives of z",
-        stacklevel=outside_stacklevel(),
+    coefficients = maps.output.tolist()
+    name, gain = flat_system.output_labels[0], coefficients[0]
+    terms = [f"{value:.6g} {derivative_name('z', k)}" for k, value in enumerate(coefficients) if value]
+    at_rest = f"at rest z is {name} times {1.0 / gain:.6g}" if gain else f"at rest {name} is 0"
+    raise ValueError(
+        f"the flat output of {flat_system.name} must be its output, got a plant with zeros: {name} = "
+        f"{' + '.join(terms)}, z the flat output that python-control has chosen; {at_rest}. For a plan of z name it by "
+        "labels= of create_flat_iosystem; for limits, or other flat outputs, use ctrlplan.flat_system; for a plan of "
+        f"{name} create_feedforward_iosystem"
     )
 
 

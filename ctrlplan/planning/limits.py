@@ -327,6 +327,9 @@ class Limited:
         self.bounds = tuple(Naming(self.seen(plan), self._quantities, self.loop, plan.naxes).bounds(limits))
         if not self.bounds:
             raise ValueError("limits must name at least one signal, got none")
+        check_limits = getattr(system, "check_limits", None)
+        if check_limits is not None and self._on_path is None:
+            check_limits(plan, {signal.name for bound in self.bounds for signal, _ in bound.terms})
         self._local = [k for k, bound in enumerate(self.bounds) if not bound.in_loop]
         self.order = max((self.bounds[k].order for k in self._local), default=0)
         self.derivatives_only = all(bound.axis is not None for bound in self.bounds)

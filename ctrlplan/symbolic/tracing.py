@@ -37,7 +37,10 @@ _AGAIN = 3
 _FEWEST = 8
 """Minimum number of points with finite values for a comparison."""
 
-_PACKAGES = tuple(str(Path(file).parent) for file in (__file__, ca.__file__, ct.__file__, np.__file__))
+_PACKAGES = (
+    str(Path(__file__).parents[1] / "flatness"),
+    *(str(Path(file).parent) for file in (__file__, ca.__file__, ct.__file__, np.__file__)),
+)
 """Folders of the code that calls a block, or that it calls."""
 
 
@@ -193,7 +196,7 @@ def _agreed(block: Traceable, values: Params, known: list[tuple[Point, Answer]])
         try:
             trace = _trace(block, values, symbols)
         except (Exception, SystemExit) as error:  # any exception of a block for symbols
-            why = why or _described(error)
+            why = why or described(error)
             continue
         wrong = _disagreement(trace, known)
         if not wrong:
@@ -212,11 +215,11 @@ def _error_of(block: Traceable, point: Point) -> str:
         for function in (block.output(values), block.update(values)):
             function(t, x.copy(), u.copy())
     except (Exception, SystemExit) as error:  # any exception of a block
-        return _described(error)
+        return described(error)
     return ""
 
 
-def _described(error: BaseException) -> str:
+def described(error: BaseException) -> str:
     """Kind and message of an error, and the line of the user's code from which it comes."""
     lines = str(error).strip().splitlines() or [""]
     said = f"{type(error).__name__}: {lines[-1]:.120}"

@@ -152,6 +152,13 @@ def _initial(flat: DerivedFlatSystem, start: ArrayLike | None, extension: int) -
     found = finite_vector(start, "start", str(extension))
     if found.size != extension:
         raise ValueError(f"start must be {extension} states of the extension, got {found.size}")
+    maps, p = flat.maps, flat.parameter_values()
+    point = [flat.operating_point[name] for name in flat.state_labels]
+    if not maps.is_regular(np.concatenate([point, found]), p):
+        raise ValueError(
+            f"start must be states of the extension at which the law of {flat.name} is regular, got {found.tolist()}, "
+            "at which it is singular with the states of the operating point"
+        )
     return found
 
 

@@ -21,12 +21,12 @@ from ctrlplan.flatness.derived import DerivedFlatSystem
 from ctrlplan.flatness.deriving import flat_system
 from ctrlplan.flatness.verify import (
     check_linearises,
+    check_output,
     checked_plant,
     finite_rows,
     flat_labels,
     planned_probes,
     random_probes,
-    warn_of_output,
 )
 from ctrlplan.systems.derived_laws import InputLimits, create_derived_law, references
 from ctrlplan.systems.poles import checked_gains
@@ -122,15 +122,9 @@ def create_flat_iosystem(
         equations give no law either: a derivative below the last depends on an
         input (the message says which), the decoupling matrix is singular, or the
         flags are too short; if `forward`, `reverse` and the
-        equations of the plant are inconsistent; or if poles or labels are
-        wrong.
-
-    Warns
-    -----
-    UserWarning
-        If `flat` is a `LinearFlatSystem` whose output is not the flat output that
-        python-control has chosen, but a multiple of it, or a sum of its
-        derivatives if the plant has zeros, and `labels` is not given.
+        equations of the plant are inconsistent; if `flat` is a `LinearFlatSystem`
+        with zeros, whose output is not a flat output, and `labels` is not given; or
+        if poles or labels are wrong.
 
     Notes
     -----
@@ -139,10 +133,10 @@ def create_flat_iosystem(
     is not verified.
 
     The plant in the loop must have its states as outputs under their names, as
-    the plants of `ctrlplan.plants` have. References belong to the flat outputs:
-    the flat output of a `LinearFlatSystem` is chosen by python-control and need
-    not be its output; its maps are computed here from its matrices in exact
-    arithmetic.
+    the plants of `ctrlplan.plants` have. The flat output of a `LinearFlatSystem` is
+    its output, of which that of python-control is a multiple; with zeros it is that
+    of python-control, which `labels` must name. Its maps are computed here from its
+    matrices in exact arithmetic.
 
     The controller uses the parameters that `flat` has when it is constructed; a
     simulation of the loop with other parameters shows the effect of model errors.
@@ -189,7 +183,7 @@ def _static_law(
     """Law of a plant that static feedback linearises, by its own maps."""
     plant = checked_plant(flat, "flat")
     if labels is None:
-        warn_of_output(flat)
+        check_output(flat)
         labels = flat.flat_labels if isinstance(flat, FlatSystem) else None
     probes = random_probes(plant)
     names = flat_labels(plant, probes, labels)

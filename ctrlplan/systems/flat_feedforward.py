@@ -17,6 +17,9 @@ from ctrlplan.systems.source import switches_of
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 
+_MOST_STEPS = 1_000_000
+"""Maximum number of steps of a horizon."""
+
 
 def create_flat_feedforward_iosystem(
     flat: FlatSystem,
@@ -78,7 +81,7 @@ def create_flat_feedforward_iosystem(
     >>> cp.simulate(wanted, [0.0, 0.5, 1.0]).outputs[0].round(6).tolist()
     [0.0, 1.0, 2.0]
     """
-    check_kind(flat, "flat", FlatSystem)
+    check_kind(flat, "flat", FlatSystem, "a FlatSystem of ctrlplan, as ctrlplan.flat_system derives one")
     outputs = [f"xd[{k}]" for k in range(flat.nstates)] if states else []
     outputs += [f"ud[{k}]" for k in range(flat.ninputs)]
     if plan is not None:
@@ -134,7 +137,7 @@ def reference_window(
     dt : float
         Time between its samples [s], above 0.
     count : int
-        Number of steps.
+        Number of steps, at most 1,000,000.
     flat : FlatSystem, optional
         The plant.
     order : int, optional
@@ -164,12 +167,12 @@ def reference_window(
     ((3, 6), (1, 5), [1.9996, 1.9999, 2.0, 2.0, 2.0, 2.0])
     """
     check_kind(plan, "plan", Trajectory)
-    steps = checked_count(count, "count", 1)
+    steps = checked_count(count, "count", 1, _MOST_STEPS)
     begin, spacing = checked_finite(time, "time"), checked_finite(dt, "dt", above=0.0)
     times = begin + spacing * np.arange(steps + 1)
     if flat is None:
         return plan.jet(times, checked_count(order, "order"))
-    check_kind(flat, "flat", FlatSystem)
+    check_kind(flat, "flat", FlatSystem, "a FlatSystem of ctrlplan, as ctrlplan.flat_system derives one")
     x, u = flat.states_and_inputs(plan, times)
     return x, u[:, :-1]
 

@@ -17,13 +17,16 @@ from scipy.linalg import solve_continuous_are
 from ctrlplan._checks import check_kind, check_signals, checked_vector, real_array
 from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, EventName, Params, Value
-from ctrlplan.flatness import DerivedFlatSystem, FlatSystem
+from ctrlplan.flatness import DerivedFlatSystem, FlatSystem, flat_system
 from ctrlplan.systems.derived_laws import InputLimits, create_derived_law, input_bounds
 from ctrlplan.systems.flat import create_flat_iosystem, derived_system_of
 from ctrlplan.systems.source import create_source_iosystem, switches_of
 from ctrlplan.traits import declare, traits_of
 from ctrlplan.trajectories import PathPlan, Trajectory
 from ctrlplan.trajectories.trajectory import check_end
+
+_CHECKED = 401
+"""Times along a plan at which a law without states must be regular."""
 
 _SETTLED = 1e-9
 """Size of the rates at the end of a plan, relative to their terms, below which the plant rests there."""
@@ -59,6 +62,11 @@ class FlatLaw(Displayed):
         if derived is None:
             return create_flat_iosystem(flat, self.poles, labels=flat.flat_labels, name="law")
         start = None if self.quasi_static else derived.extension_along(plan, plan.start)
+        if self.quasi_static and derived.extension:
+            from ctrlplan.flatness.feedback import check_law_along
+
+            times = np.linspace(plan.start, plan.end, _CHECKED)
+            check_law_along(derived.analysis, derived.extended_along(plan, times), times, str(flat.name))
         return create_derived_law(
             derived,
             self.poles,
@@ -262,7 +270,7 @@ def flat_loop(
     >>> found.outputs["angle"].round(6).tolist()
     [0.0, 1.0, 2.0]
     """
-    check_kind(flat, "flat", FlatSystem)
+    flat = _own(flat)
     check_kind(plan, "plan", Trajectory)
     if (poles is None) == (law is None):
         raise TypeError("one of poles and law must be given, got " + ("neither" if law is None else "both"))
@@ -287,6 +295,7 @@ def flat_loop(
         name=f"{flat.name}_loop",
         ignore_outputs=unused,
     )
+    _check_limits(flat, axes, limits)
     first = flat.states_and_inputs(axes, plan.start)[0] if initial_state is None else initial_state
     own = traits_of(controller).initial_state if controller.nstates else None
     start = checked_vector(first, "initial_state", flat.nstates) if np.ndim(first) else _wrong_state(first, flat)
@@ -300,6 +309,34 @@ def _check_no_step(plan: Trajectory, flat: FlatSystem) -> None:
             f"plan must be continuous for a law of {flat.name}, got a step of {jump.label} by {jump.size:.4g} at "
             f"{jump.time:g} s; give a plan at rest at the goal, and initial_state= from which it is approached"
         )
+
+
+def _check_limits(flat: FlatSystem, plan: Trajectory, limits: InputLimits | None) -> None:
+    """Raise if an input with which the plant rests at an end of the plan is beyond its limits."""
+    bounds = input_bounds(limits, flat)
+    if bounds is None:
+        return
+    for time in (plan.start, plan.end):
+        if plan.jet(time, 2)[1:].any():
+            continue
+        u = flat.states_and_inputs(plan, time)[1]
+        slack = 1e-9 * np.abs(u)
+        for name, value, low, high, room in zip(flat.input_labels, u, *bounds, slack, strict=True):
+            if not low - room <= value <= high + room:
+                raise ValueError(
+                    f"limits[{name!r}] must contain the input with which {flat.name} is at rest at {time:g} s, "
+                    f"{value:.6g}, got {low:g} to {high:g}"
+                )
+
+
+def _own(flat: fs.FlatSystem) -> FlatSystem:
+    """Flat system of this package for one of python-control."""
+    if isinstance(flat, fs.LinearFlatSystem):
+        return flat_system(flat, list(flat.output_labels))
+    if isinstance(flat, fs.FlatSystem) and not isinstance(flat, FlatSystem):
+        return derived_system_of(flat, True) or flat
+    check_kind(flat, "flat", FlatSystem, "a flat system")
+    return flat
 
 
 def _wrong_state(given: Value, flat: FlatSystem) -> Array:

@@ -504,12 +504,85 @@ def test_other_values_of_parameters():
 
 @pytest.mark.slow
 def test_margins_over_ranges_of_parameters():
-    flat = cp.flat_system(cp.plants.Crane().iosystem(), ["x", "z"], at={"R": 10.0})
-    plan = rest_to_rest(["x", "z"], [4, 4], [20.0, 11.0], 15.0, [0.0, 10.0])
-    limits, params = {"C": (-1500.0, 0.0)}, {"load_mass": (400.0, 600.0), "gravity": 9.81}
-    found = cp.margins(plan, limits, flat, params=params)
-    known = cp.margins(plan, limits, cp.plants.Crane(), params=params)
-    assert found.active.parameters == {"load_mass": 600.0}
-    assert found.active.fraction == pytest.approx(known.active.fraction, rel=1e-8)
+    """A mass with a force: the largest mass is the worst; the quintic move has the peak acceleration 10/sqrt(3)."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: [x[1], u[0] / p["m"]], None, states=["x", "v"], inputs=["F"], params={"m": 2.0}, name="mass"
+    )
+    flat, plan = cp.flat_system(plant, "x"), rest_to_rest(["x"], [2], [1.0], 1.0)
+    found = cp.margins(plan, {"F": 20.0}, flat, params={"m": (1.0, 3.0)})
+    assert found.active.parameters == {"m": 3.0}
+    assert abs(found.active.value) == pytest.approx(3.0 * 10.0 / math.sqrt(3.0), rel=1e-8)
     with pytest.raises(ValueError, match="params must be among"):
-        cp.margins(plan, limits, flat, params={"load": 1.0})
+        cp.margins(plan, {"F": 20.0}, flat, params={"mass": 1.0})
+
+
+@pytest.mark.parametrize("count", [7, 401])
+def test_angles_of_quantities_are_continuous_along_the_plan(count):
+    """Two circles: the heading grows by two turns, and the speed does not change its sign."""
+    t = np.linspace(3.0, 18.0, count)
+    flat = derived(CASES["unicycle"])
+    found = flat.quantities(AROUND.jet(t, 2))
+    (_, _, heading), (speed, turning) = unicycle_map(AROUND.jet(np.linspace(0.0, 18.0, 1801), 2))
+    np.testing.assert_allclose(found["v"], np.interp(t, np.linspace(0.0, 18.0, 1801), speed), rtol=1e-6)
+    if count > 50:
+        np.testing.assert_allclose(
+            np.diff(found["th"]), np.diff(np.interp(t, np.linspace(0, 18, 1801), heading)), atol=1e-6
+        )
+        np.testing.assert_allclose(found["w"], np.interp(t, np.linspace(0.0, 18.0, 1801), turning), rtol=1e-6)
+    shuffled = np.random.default_rng(0).permutation(count)
+    np.testing.assert_allclose(flat.quantities(AROUND.jet(t[shuffled], 2))["v"], found["v"][shuffled], rtol=1e-12)
+
+
+def test_limits_of_an_angle_that_turns_are_rejected():
+    flat = derived(CASES["unicycle"])
+    with pytest.raises(ValueError, match=r"th must stay within half a turn .*, got 12\.57 rad"):
+        cp.margins(AROUND, {"th": (-20.0, 11.0)}, flat)
+    assert cp.margins(AROUND, {"v": (0.0, 4.0)}, flat).active.value == pytest.approx(math.pi, rel=1e-3)
+    found = cp.margins(circle(0.3), {"th": 3.0}, flat)
+    assert found.active.value == pytest.approx(0.3 * math.tau, rel=1e-6)
+
+
+@pytest.mark.parametrize("orders", [(2, 1), (2, 2)])
+def test_optimal_control_of_python_control_on_equal_and_unequal_orders(orders):
+    """The plan begins at rest, obeys the equations and costs less than to stay."""
+    states = ["a", "va", "b", "vb"][: sum(orders)]
+    plant = ct.nlsys(
+        (lambda t, x, u, p: [x[1], u[0], u[1]]) if orders == (2, 1) else (lambda t, x, u, p: [x[1], u[0], x[3], u[1]]),
+        None,
+        states=states,
+        inputs=["ua", "ub"],
+        outputs=states,
+        name="axes",
+    )
+    flat = cp.flat_system(plant, ["a", "b"])
+    assert flat.orders == orders
+    end = np.array([1.0, 0.0, 2.0, 0.0])[: len(states)]
+    found = fs.solve_flat_optimal(
+        flat,
+        np.linspace(0.0, 2.0, 11),
+        np.zeros(len(states)),
+        np.zeros(2),
+        trajectory_cost=lambda x, u: u @ u,
+        terminal_cost=lambda x, u: 10.0 * (x - end) @ (x - end),
+        minimize_method="SLSQP",
+        basis=fs.PolyFamily(6),
+    )
+    x, u = found.eval(np.linspace(0.0, 2.0, 21))
+    np.testing.assert_allclose(np.concatenate([x[:, 0], u[:, 0]]), 0.0, atol=1e-9)
+    error = x[:, -1] - end
+    assert np.trapezoid((u**2).sum(axis=0), dx=0.1) + 10.0 * error @ error < 0.5 * 10.0 * end @ end
+    rates = np.array([plant.dynamics(0.0, *both) for both in zip(x.T, u.T, strict=True)]).T
+    t, h = np.linspace(0.0, 2.0, 21), 1e-4
+    slopes = (found.eval(t[1:-1] + h)[0] - found.eval(t[1:-1] - h)[0]) / (2.0 * h)
+    np.testing.assert_allclose(slopes, rates[:, 1:-1], atol=1e-6)
+
+
+def test_flags_states_and_jets_of_wrong_sizes():
+    flat = derived(CASES["crane"])
+    for flag in ([np.zeros(3), np.zeros(5)], [np.zeros(5)]):
+        with pytest.raises(ValueError, match="flag must be 5 of x, 5 of z entries, got"):
+            flat.reverse(flag)
+    with pytest.raises(ValueError, match=r"x and u must be 6 states and 2 inputs, got shapes \(3,\)"):
+        flat.forward(np.zeros(3), np.zeros(2))
+    with pytest.raises(ValueError, match="jet must be finite"):
+        flat.quantities(np.full((5, 2, 3), np.nan))

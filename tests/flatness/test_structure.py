@@ -333,3 +333,43 @@ def test_blocks_that_cannot_be_traced_are_named_with_the_line(update, line):
     plant = ct.nlsys(update, None, states=["x"], inputs=["u"], name="plant")
     with pytest.raises(ValueError, match=f"block plant cannot be .*{line}"):
         cp.flat_system(plant, "x")
+
+
+@pytest.mark.parametrize(
+    ("outputs", "reason"),
+    [
+        (lambda x, u, p: [x[9]], r"IndexError: .*, in test_structure\.py, line \d+"),
+        (lambda x, u, p: [math.sin(x[0])], r"TypeError: .* line \d+: \(lambda x, u, p: \[math"),
+        (lambda x, u: [x[0]], r"takes 2 positional arguments but 3 were given$"),
+        (lambda x, u, p: None, r"'NoneType'$"),
+    ],
+)
+def test_functions_of_flat_outputs_that_fail_are_named_with_the_line(outputs, reason):
+    with pytest.raises(TypeError, match=rf"flat_outputs must be a function h\(x, u, params\) .*{reason}"):
+        cp.flat_system(two_mass(0.0), outputs)
+
+
+def test_parameters_that_are_no_numbers_and_systems_without_states():
+    plant = ct.nlsys(lambda t, x, u, p: [u[0] / p["m"]], None, states=["v"], inputs=["F"], params={"m": 2.0}, name="p")
+    with pytest.raises(ValueError, match=r"params\['m'\] must be finite, got nan"):
+        cp.flat_system(plant, "v", params={"m": np.nan})
+    with pytest.raises(ValueError, match="finite"):
+        cp.flat_system(plant, "v", params={"m": 0.0})
+    with pytest.raises(ValueError, match="system must have states and inputs, got 0 and 1"):
+        cp.flat_system(ct.ss([], [], [], [[1.0]]))
+
+
+def test_smooth_functions_take_the_place_of_operations_at_their_kink():
+    """A vehicle under water with quadratic drag that begins at rest, as the error says."""
+
+    def plant(size):
+        return system("diver", "x v", "F", lambda x, v, F: [v, (F - 30.0 * v * size(v)) / 50.0])
+
+    with pytest.raises(ValueError, match=r"abs of v at 0; .*, such as np\.sqrt\(x\*\*2 \+ d\*\*2\) for abs"):
+        cp.flat_system(plant(np.abs), "x")
+    flat = cp.flat_system(plant(lambda v: np.sqrt(v**2 + 1e-8)), "x")
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0), cp.Waypoint(4, 0, 0, 0)], labels="x")
+    t = np.linspace(0.0, 4.0, 41)
+    _, v, a = plan.jet(t, 2)[:, 0]
+    _, force = flat.states_and_inputs(plan, t)
+    np.testing.assert_allclose(force[0], 50.0 * a + 30.0 * v * np.sqrt(v**2 + 1e-8), atol=1e-10)

@@ -152,6 +152,10 @@ def test_the_extension_starts_where_it_is_told_to():
     for wrong in ([1.0], [1.0, np.nan], [[1.0, 2.0]]):
         with pytest.raises(ValueError, match="start"):
             cp.create_flat_iosystem(flat, [FAST, FAST], start=wrong)
+    wheel = cp.flat_system(CASES["unicycle"].plant, ["x", "y"], at={"v": 1.0})
+    for speed in (0.0, 1e-9):
+        with pytest.raises(ValueError, match=r"start must be .* at which the law of unicycle is regular"):
+            cp.create_flat_iosystem(wheel, [[-1.0, -2.0]] * 2, start=[speed])
 
 
 def test_labels_and_suffix_name_the_references():
@@ -246,3 +250,29 @@ def test_flat_outputs_of_different_orders_give_a_loop_without_warnings():
     assert flat.orders == (2, 1)
     loop = cp.flat_loop(flat, move(["a", "b"], [1.0, 2.0], [0.0, 0.0]), poles=[[-1.0, -2.0], [-3.0]])
     assert cp.simulate(loop, [0.0, 3.0]).outputs["b"][-1] == pytest.approx(2.0, abs=1e-6)
+
+
+def test_a_law_without_states_is_rejected_near_its_singular_heading():
+    """A quarter turn of a car whose speed is determined by x only."""
+    flat = cp.flat_system(CASES["unicycle"].plant, ["x", "y"], at={"v": 1.0})
+    poles = [[-1.0], [-1.0, -2.0]]
+    law = cp.FlatLaw(poles, quasi_static=True)
+    for turn, good in ((1.4, True), (1.5, False), (2.0, False)):
+        w = turn / 5.0
+        t = np.linspace(0.0, 5.0, 11)
+        arc = [
+            cp.Waypoint.from_jets(
+                s,
+                x=[np.sin(w * s) / w, np.cos(w * s), -w * np.sin(w * s), -w * w * np.cos(w * s)],
+                y=[(1.0 - np.cos(w * s)) / w, np.sin(w * s), w * np.cos(w * s), -w * w * np.sin(w * s)],
+            )
+            for s in t
+        ]
+        plan = cp.PiecewiseSpline(arc)
+        if good:
+            found = cp.simulate(cp.flat_loop(flat, plan, law=law), t, rtol=1e-10)
+            np.testing.assert_allclose([found.outputs["x"], found.outputs["y"]], plan(t), atol=1e-6)
+        else:
+            with pytest.raises(ValueError, match=r"quasi_static must be False for this plan of unicycle.* law with st"):
+                cp.flat_loop(flat, plan, law=law)
+            assert cp.flat_loop(flat, plan, poles=[[-1.0, -2.0]] * 2).nstates == 4

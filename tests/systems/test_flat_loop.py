@@ -160,7 +160,8 @@ def test_a_window_ahead():
     np.testing.assert_array_equal(cp.reference_window(LANE, 3.9, 0.1, 3), LANE.jet(3.9 + 0.1 * np.arange(4), 2))
     after, _ = cp.reference_window(TURN, 0.95, 0.1, 3, flat=MOTOR)
     np.testing.assert_allclose(after[0, 1:], 2.0, rtol=1e-12)
-    for wrong in ({"dt": 0.0}, {"count": 0}, {"time": np.nan}):
+    assert cp.reference_window(LANE, 0.0, 0.01, 400, flat=CAR)[0].shape == (3, 401)
+    for wrong in ({"dt": 0.0}, {"count": 0}, {"count": 10_000_000}, {"time": np.nan}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             cp.reference_window(LANE, **{"time": 0.0, "dt": 0.1, "count": 3, **wrong})
 
@@ -226,3 +227,107 @@ def test_weights_that_are_not_symmetric_or_finite(q, message, size):
     law = cp.TVLQR(size * np.asarray(q), [[1.0]])
     with pytest.raises(ValueError, match=message):
         cp.flat_loop(cp.flat_system(plant, "p"), plan, law=law)
+
+
+def test_a_law_of_measured_outputs_with_an_observer_of_python_control():
+    """Positions of two masses are measured; an estimator by `create_estimator_iosystem` gives the law its states.
+
+    The estimator is stationary, P its covariance, and starts at the
+    state of the plan, the plant 0.1 m from it.
+    """
+    states = ["x1", "v1", "x2", "v2"]
+    a = np.array([[0, 1, 0, 0], [-50, 0, 50, 0], [0, 0, 0, 1], [25, 0, -25, 0]])
+    b, c = np.array([[0.0], [1.0], [0.0], [0.0]]), np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0]])
+    plant = ct.ss(a, b, c, 0.0, states=states, inputs="u", outputs=["m1", "m2"], name="two_masses")
+    noise, measured = 10.0 * np.eye(4), 1e-3 * np.eye(2)
+    covariance = ct.lqe(a, np.eye(4), c, noise, measured)[1]
+    estimator = ct.create_estimator_iosystem(
+        ct.ss(a, np.hstack([b, np.eye(4)]), c, 0.0, inputs=["u", *(f"w{k}" for k in range(4))], outputs=["m1", "m2"]),
+        noise,
+        measured,
+        P0=covariance,
+        control_indices=["u"],
+        disturbance_indices=[f"w{k}" for k in range(4)],
+        estimate_labels="{i}",
+        measurement_labels=["m1", "m2"],
+        control_labels=["u"],
+    )
+    flat = cp.flat_system(plant, "x2")
+    law = cp.create_flat_iosystem(flat, [-2.0, -2.5, -3.0, -3.5])
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0, 0, 0)], labels="x2")
+    source = cp.create_source_iosystem(plan, 4, suffix="_ref", name="plan")
+    renamed = dict(zip(estimator.output_labels, states, strict=True))
+    estimator.set_outputs([renamed[name] for name in estimator.output_labels])
+    loop = ct.interconnect([source, law, estimator, plant], inputs=0, outputs=["m1", "m2", "u"], name="loop")
+    start = np.array([0.1, 0.0, 0.1, 0.0])
+    first = np.concatenate([np.zeros(4), covariance.ravel(), start])
+    found = cp.simulate(loop, np.linspace(0.0, 15.0, 151), initial_state=first)
+    error = found.outputs["m2"] - plan(found.time)
+    assert error[0] == pytest.approx(0.1)
+    assert np.abs(error[-1]) < 1e-5
+    free = np.concatenate([np.zeros(4), covariance.ravel(), np.zeros(4)])
+    exact = cp.simulate(loop, np.linspace(0.0, 2.5, 26), initial_state=free, rtol=1e-9)
+    np.testing.assert_allclose(exact.outputs["m2"], plan(exact.time), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_riccati_law_costs_no_more_than_gains_scheduled_on_speed():
+    """Terminal cost included, from a start off by 1 % of the move, along a bend on which the car accelerates.
+
+    Gains over speed are those of a straight line, in the frame of the car, as in
+    python-control's example of gain scheduling.
+    """
+    q, r, final = np.diag([1.0, 1.0, 10.0]), np.diag([1.0, 10.0]), np.diag([1.0, 1.0, 10.0])
+    ends = [(0.0, [0, 2, 0, 0], [0, 0, 0, 0]), (6.0, [40, 10, 0, 0], [8, 3, 0, 0])]
+    plan = cp.PolySpline([cp.Waypoint.from_jets(t, x=x, y=y) for t, x, y in ends])
+    speeds = np.linspace(1.0, 15.0, 29)
+    straight = [(np.array([[0, 0, 0], [0, 0, v], [0, 0, 0]]), np.array([[1, 0], [0, 0], [0, v / 3.0]])) for v in speeds]
+    gains = np.array([ct.lqr(*slopes, q, r)[0] for slopes in straight])
+
+    def scheduled(t, x, u, p):
+        states, inputs = CAR.states_and_inputs(plan, t)
+        c, s = np.cos(states[2]), np.sin(states[2])
+        frame = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        k = int(np.argmin(np.abs(speeds - inputs[0])))
+        return inputs - gains[k] @ frame @ (np.asarray(u) - states)
+
+    block = ct.nlsys(None, scheduled, inputs=CAR.state_labels, outputs=CAR.input_labels, name="law")
+    names = ["x", "y", "th", "v", "delta"]
+    theirs = ct.interconnect([block, car], inputs=0, outputs=names, name="scheduled")
+    start = CAR.states_and_inputs(plan, 0.0)[0] + [0.0, 0.4, 0.0]
+    ours = cp.flat_loop(CAR, plan, law=cp.TVLQR(q, r, final=final), initial_state=start)
+    t = np.linspace(0.0, 6.0, 601)
+    wanted = np.concatenate(CAR.states_and_inputs(plan, t))
+    costs = []
+    for loop in (ours, theirs):
+        found = cp.simulate(loop, t, initial_state=start)
+        e = np.array([found.outputs[name] for name in names]) - wanted
+        rates = np.einsum("it,ij,jt->t", e[:3], q, e[:3]) + np.einsum("it,ij,jt->t", e[3:], r, e[3:])
+        costs.append(np.trapezoid(rates, t) + e[:3, -1] @ final @ e[:3, -1])
+    assert costs[0] <= costs[1]
+
+
+@pytest.mark.slow
+def test_payloads_in_a_monte_carlo():
+    """Draws of the payload are parameters of the plant, not of the law, which has no integral action here."""
+    rest = [0.0] * 4
+    ends = [(0.0, [0.0, *rest], [10.0, *rest]), (8.0, [6.0, *rest], [11.0, *rest])]
+    plan = cp.PolySpline([cp.Waypoint.from_jets(t, x=x, z=z) for t, x, z in ends])
+    flat = cp.flat_system(cp.plants.Crane().iosystem(), ["x", "z"], at={"R": 10.0})
+
+    def loop(name, plan):
+        return cp.flat_loop(flat, plan, poles=[FAST, FAST])
+
+    found = cp.monte_carlo(
+        loop,
+        {"load_mass": np.array([490.0, 500.0, 510.0])},
+        {"plan": plan},
+        np.linspace(0.0, 12.0, 61),
+        outputs=["x", "z"],
+        controls=["F", "C"],
+        progress=False,
+    )
+    assert found.finished == 3
+    assert not found.failures
+    errors = found.metrics["plan"]["iae_z"]
+    assert errors[1] < 1e-6 < 0.1 < min(errors[0], errors[2])

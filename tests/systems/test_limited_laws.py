@@ -149,3 +149,11 @@ def test_rotors_that_enter_by_their_squares_stay_within_their_speeds():
     error = np.array([found.outputs["x"], found.outputs["z"]]) - plan(t)
     assert np.abs(error[1]).max() <= 2.0 + 1e-6
     assert np.abs(error[:, -1]).max() < 1e-4
+
+
+def test_limits_must_contain_the_inputs_at_rest():
+    """A winch that cannot carry the load."""
+    with pytest.raises(
+        ValueError, match=r"limits\['C'\] must contain the input .* at rest at 0 s, -1226\.25, got -100"
+    ):
+        cp.flat_loop(FLAT, lift(), poles=POLES, limits={"C": (-100.0, 100.0)})
