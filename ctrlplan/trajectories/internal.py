@@ -9,7 +9,7 @@ from ctrlplan.trajectories.trajectory import Trajectory
 
 
 class InternalTrajectory(Trajectory):
-    """Base class of a trajectory that no user is given; names of derived classes begin with _.
+    """Base class of a trajectory that no user is given.
 
     Attributes
     ----------
@@ -17,6 +17,7 @@ class InternalTrajectory(Trajectory):
         Description of it in messages.
     """
 
+    can_be_stored = False
     what: ClassVar[str]
 
     def map_time(self, origin: float, target: float, rate: float) -> Self:

@@ -107,6 +107,8 @@ class Trajectory(Displayed, Fields, ABC):
     waypoints: tuple[Waypoint, ...] = ()
 
     kinds: ClassVar[dict[str, type[Trajectory]]] = {}
+    can_be_stored: ClassVar[bool] = True
+    """Whether a file may have plans of this class."""
 
     __array_ufunc__ = None  # products with numpy scalars are those of this class; arrays are not factors
 
@@ -118,7 +120,7 @@ class Trajectory(Displayed, Fields, ABC):
             if many in cls.__dict__ and one not in cls.__dict__:
                 setattr(cls, one, _no_rows)
         abstract = (getattr(f, "__isabstractmethod__", False) for f in (cls.segment_jet, cls.map_time, cls.from_dict))
-        if cls.__name__.startswith("_") or any(abstract):
+        if cls.__name__.startswith("_") or any(abstract) or not cls.can_be_stored:
             return
         former = Trajectory.kinds.setdefault(cls.__name__, cls)
         # A class that is defined again, in a notebook cell or by a reload, replaces the previous one.
