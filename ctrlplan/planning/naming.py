@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from ctrlplan._checks import check_kind, default_labels
+from ctrlplan._types import Array
 from ctrlplan.planning.bounds import Bound, Limits, Region, Signal, is_listed
 from ctrlplan.planning.quantities import Quantities
 from ctrlplan.trajectories import Trajectory, derivative_name
@@ -202,15 +203,29 @@ def _by_axis(name: str, limit: object, naxes: int) -> list[object]:
 
 
 def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
-    """Lowest order of the jet that each quantity depends on, at rest at the start."""
+    """Lowest order of the jet that each quantity depends on: at rest at the start, or within a plan in motion."""
     still = np.zeros((_HIGHEST + 1, plan.naxes, 1))
     still[0] = plan.initial[:, None]
+    orders, rejection = _accepted(quantities, still)
+    if not orders:  # as those of a vehicle, whose heading is not determined at rest
+        moving = plan.jet(np.array([0.5 * (plan.breakpoints[0] + plan.breakpoints[1])]), _HIGHEST)
+        orders, rejection = _accepted(quantities, moving)
+    if not orders:
+        raise ValueError(
+            f"quantities must accept jets (order + 1, {plan.naxes}, ntime) of up to {_HIGHEST} derivatives, got "
+            f"{type(rejection).__name__}: {rejection}"
+        )
+    return orders
+
+
+def _accepted(quantities: Quantities, jet: Array) -> tuple[dict[str, int], Exception | None]:
+    """Lowest order of a jet with which quantities are defined, and why those of other orders are not."""
     orders: dict[str, int] = {}
     rejection: Exception | None = None
-    for order in range(_HIGHEST + 1):
+    for order in range(len(jet)):
         try:
             with np.errstate(all="ignore"):
-                found = quantities(still[: order + 1])
+                found = quantities(jet[: order + 1])
         except (ValueError, IndexError, KeyError) as reason:  # it depends on higher orders
             rejection = reason
             continue
@@ -218,9 +233,4 @@ def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
             raise TypeError(f"quantities must return a mapping of names to signals, got {type(found).__name__}")
         for name in found:
             orders.setdefault(name, order)
-    if not orders:
-        raise ValueError(
-            f"quantities must accept jets (order + 1, {plan.naxes}, ntime) of up to {_HIGHEST} derivatives, got "
-            f"{type(rejection).__name__}: {rejection}"
-        )
-    return orders
+    return orders, rejection
