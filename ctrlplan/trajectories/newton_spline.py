@@ -228,6 +228,10 @@ class NewtonSpline(WaypointSpline):
             rows = self.segment_rows(segment, float(s[0]), order)
             if rows is not None:
                 return np.array(rows).T[:, :, None]
+        return self._jet(s, order)
+
+    def _jet(self, s: Array, order: int) -> Array:
+        """Derivatives (order + 1, naxes, ntime) at times since the start."""
         u = s / self._duration
         scale = derivative_scale(self._duration, order)
         out = np.empty((order + 1, self.naxes, u.size))
@@ -250,6 +254,10 @@ class NewtonSpline(WaypointSpline):
         """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""
         if not is_moderate(self._duration, order):
             return None
+        if s == 0.0 or s == self._moments[1] - self._moments[0]:
+            # At the ends, sums over the functions in their order have the prescribed zeros in every bit.
+            ends: list[list[float]] = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0].T.tolist()
+            return ends
         parts, u = self._columns, s / self._duration
         if len(parts) == 1:
             _, system, columns = parts[0]
