@@ -3,37 +3,36 @@
 from __future__ import annotations
 
 import inspect
+import os
+import threading
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol, TypeAlias, TypeGuard
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._lru import Lru
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event, Prepared, SolverError, prepare
 from ctrlplan.simulation.built_forms import NotCompiledError
 from ctrlplan.simulation.methods.delegated import DELEGATED
+from ctrlplan.studies.alike import Linear
+from ctrlplan.studies.batches import Batches
+from ctrlplan.studies.checkpoint import digest
 from ctrlplan.studies.comparison import Comparison, comparison_of
 from ctrlplan.studies.draw_results import DrawResults, Outcome, band_samples
 from ctrlplan.studies.ensemble import Ensemble
-from ctrlplan.studies.executing import (
-    Account,
-    Executor,
-    Failed,
-    Shared,
-    checked_executor,
-    checked_timeout,
-    executed,
-    tried,
-)
+from ctrlplan.studies.executing import Execution, executed
+from ctrlplan.studies.executors import Executor
 from ctrlplan.studies.experiment import Experiment
 from ctrlplan.studies.measures import Measure, shown_measures
+from ctrlplan.studies.outcomes import Failed, OneByOne, Runs, tried
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
 
@@ -43,10 +42,14 @@ Forms: TypeAlias = Mapping[str, System]
 Draw: TypeAlias = dict[str, float]
 """Parameters of one draw by name."""
 
-_Task: TypeAlias = tuple[Callable[[Draw], Outcome], "Forms | None"]
+Samples: TypeAlias = NDArray[np.intp]
+"""Indices of the samples of the bands."""
 
 _STAND_INS = 20
 """Number of draws tried in place of a nominal loop that does not run."""
+
+_THREADS = 32
+"""Number of threads for which the loops of a function are prepared separately."""
 
 
 def monte_carlo(
@@ -66,6 +69,9 @@ def monte_carlo(
     measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
     units: Mapping[str, str] | None = None,
     executor: Executor | None = None,
+    workers: int | None = None,
+    chunk: int | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
     progress: bool = True,
     timeout: float | None = None,
 ) -> Ensemble:
@@ -121,34 +127,53 @@ def monte_carlo(
     >>> bool((found.metrics["step"]["overshoot_error"] > 80.0).all())
     True
     """
-    executor, timeout = checked_executor(executor), checked_timeout(timeout)
+    execution = Execution.from_arguments(locals())
     table = _checked_draws(draws)
     experiment = Experiment.from_arguments(locals())
     drawn_loop: _Drawn = _Built(loop) if _is_of_draws(loop, table) else _Prepared.of(loop, experiment, table)
     nominal, nominal_draw = _nominal(drawn_loop, experiment, table, units, timeout)
     drawn = [_draw(table, k) for k in range(_count(table))]
-    task, again = drawn_loop.task(experiment, drawn, executor is not None, timeout)
-    account = executed(task, drawn, executor, timeout, "draws", progress)
-    account.raise_if_none_ran("the loop")
-    if again is not None:
-        account = _by_python(account, again, experiment, drawn, timeout, progress)
+    curves = len(drawn) * len(experiment.plans) * len({*nominal.outputs, *nominal.controls})
+    samples = band_samples(experiment.timepts, curves)
+    runs, again = drawn_loop.runs(experiment, samples, drawn, executor is not None, timeout)
     shown = shown_measures(experiment.measures, list(nominal.metrics.values()))
-    results = DrawResults(_count(table), experiment.timepts, shown.keys() - nominal.measures.keys())
-    for k, outcome in account.in_order().items():
-        results.add(k, drawn[k], outcome)
-    if account.interrupted:
+    results = DrawResults(len(drawn), experiment.timepts[samples], shown.keys() - nominal.measures.keys())
+    aside: dict[int, Outcome] = {}
+
+    def collect(k: int, outcome: Outcome | Failed) -> None:
+        if again is not None and not isinstance(outcome, Failed) and any(map(_of_solver, outcome.values())):
+            aside[k] = outcome
+        else:
+            results.add(k, drawn[k], outcome)
+
+    def identity() -> dict[str, object]:
+        tables = {name: digest(values) for name, values in table.items()}
+        own = {"kind": "monte_carlo", "draws": tables, "loop": nominal.metrics, "units": dict(units or {})}
+        return own | experiment.identity()
+
+    done = executed(runs, drawn, collect, execution, "draws", identity)
+    done.raise_if_none_ran("the loop")
+    interrupted, missing = done.interrupted, set(done.missing)
+    if again is not None and aside:
+        if not interrupted:
+            here = replace(execution, executor=None, workers=None, checkpoint=None)
+            interrupted = _by_python(partial(_outcome, again, experiment, samples), aside, drawn, results, here)
+        missing |= aside.keys()
+    if interrupted:
         text = f"monte_carlo was interrupted: {results.finished} of {_count(table)} draws are returned"
         warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())
     return Ensemble(
         nominal,
         table,
-        results.metrics,
+        results.metrics(experiment.plans),
         results.timepts,
-        results.bands(),
-        failures=tuple(results.failures),
+        results.bands(experiment.plans),
+        failures=results.failures(),
         finished=results.finished,
         nominal_draw=nominal_draw,
-        interrupted=account.interrupted,
+        interrupted=interrupted,
+        sent_again=done.sent_again,
+        missing=tuple(sorted(missing)),
     )
 
 
@@ -200,13 +225,17 @@ def _binds(signature: inspect.Signature, *arguments: object, **named: object) ->
 
 
 def _outcome(
-    forms: Callable[[str], System | Builder], experiment: Experiment, plans: Iterable[str], params: Params | None
+    forms: Mapping[str, System | Builder],
+    experiment: Experiment,
+    samples: Samples,
+    plans: Iterable[str],
+    params: Params | None,
 ) -> Outcome:
     """Outcome of one draw, by plan."""
-    wanted = experiment.timepts[band_samples(experiment.timepts)]
+    wanted = experiment.timepts[samples]
 
     def measured(plan: str) -> tuple[dict[str, float], dict[str, Array]]:
-        form = forms(plan)
+        form = forms[plan]
         with DELEGATED if isinstance(form, Prepared) and form.network is None else nullcontext():
             run, metrics = experiment.run_plan(form, plan, params)
         stored = np.isin(run.t, wanted)
@@ -226,8 +255,10 @@ class _Drawn(Protocol):
     def nominal(self, params: Draw | None) -> tuple[System | Builder, Draw | None]:
         """Loop for its nominal parameters or those of a draw, and parameters of its blocks."""
 
-    def task(self, experiment: Experiment, drawn: list[Draw], elsewhere: bool, timeout: float | None) -> _Task:
-        """Function of a draw, for this process or for others; and forms that run it again if the solver fails."""
+    def runs(
+        self, experiment: Experiment, samples: Samples, drawn: list[Draw], elsewhere: bool, timeout: float | None
+    ) -> tuple[Runs[Draw, Outcome], Forms | None]:
+        """Runs of the draws, for this process or for others; and forms that run them again if the solver fails."""
 
 
 @dataclass(frozen=True)
@@ -243,13 +274,25 @@ class _Built:
     def nominal(self, params: Draw | None) -> tuple[System | Builder, Draw | None]:
         return self.build(**(params or {})), None
 
-    def task(self, experiment: Experiment, drawn: list[Draw], elsewhere: bool, timeout: float | None) -> _Task:
-        return partial(_of_build, self.build, experiment), None
+    def runs(
+        self, experiment: Experiment, samples: Samples, drawn: list[Draw], elsewhere: bool, timeout: float | None
+    ) -> tuple[Runs[Draw, Outcome], Forms | None]:
+        build, alone = partial(_with_draw, self.build), partial(_of_loop, experiment, samples)
+        return Batches(experiment, build, alone, partial(_alike, experiment, samples)), None
 
 
-def _of_build(build: Callable[..., System], experiment: Experiment, params: Draw) -> Outcome:
-    loop = build(**params)
-    return _outcome(lambda name: loop, experiment, experiment.plans, None)
+def _with_draw(build: Callable[..., System], params: Draw) -> System:
+    return build(**params)
+
+
+def _of_loop(experiment: Experiment, samples: Samples, loop: System | Builder) -> Outcome:
+    return _outcome(dict.fromkeys(experiment.plans, loop), experiment, samples, experiment.plans, None)
+
+
+def _alike(experiment: Experiment, samples: Samples, loops: Sequence[Linear]) -> list[Outcome]:
+    """Outcomes of linear loops of the same structure."""
+    found = experiment.run_alike(loops, samples) or ()
+    return [{plan: (metrics, one.signals[plan]) for plan, metrics in one.metrics.items()} for one in found]
 
 
 @dataclass(frozen=True)
@@ -284,32 +327,45 @@ class _Prepared:
     def nominal(self, params: Draw | None) -> tuple[System | Builder, Draw | None]:
         return (lambda name, plan: self.forms[name]), params
 
-    def task(self, experiment: Experiment, drawn: list[Draw], elsewhere: bool, timeout: float | None) -> _Task:
+    def runs(
+        self, experiment: Experiment, samples: Samples, drawn: list[Draw], elsewhere: bool, timeout: float | None
+    ) -> tuple[Runs[Draw, Outcome], Forms | None]:
         # Compiled and compared with Python in this process, for the first draw and a random one.
-        here = partial(_of_forms, self.forms, experiment)
+        here = partial(_of_forms, self.forms, experiment, samples)
         for k in sorted({0, int(np.random.default_rng(0).integers(len(drawn)))}):
             tried(here, drawn[k], timeout)
         light = _light(self.forms, drawn[0])
         again = None if light is None else self.forms
         if not elsewhere:
-            return partial(_of_forms, light or self.forms, experiment), again
-        sent: Forms | Builder = light or (self.loop if is_builder(self.loop) else self.forms)
-        return partial(_elsewhere, Shared(sent), experiment), again
+            return OneByOne(partial(_of_forms, light or self.forms, experiment, samples)), again
+        sent = _Sent(light or (self.loop if is_builder(self.loop) else self.forms))
+        return OneByOne(partial(_elsewhere, sent, experiment, samples)), again
 
 
-def _of_forms(forms: Forms, experiment: Experiment, params: Draw) -> Outcome:
-    return _outcome(lambda name: forms[name], experiment, experiment.plans, params)
+def _of_forms(forms: Forms, experiment: Experiment, samples: Samples, params: Draw) -> Outcome:
+    return _outcome(forms, experiment, samples, experiment.plans, params)
 
 
-def _elsewhere(shared: Shared[Forms | Builder], experiment: Experiment, params: Draw) -> Outcome:
+@dataclass(frozen=True)
+class _Sent:
+    """Loops for other processes and threads: prepared forms, or a function that builds them."""
+
+    given: Forms | Builder
+    made: Lru[int, Forms] = field(default_factory=lambda: Lru(_THREADS))
+
+    def forms(self, plans: Mapping[str, Trajectory]) -> Forms:
+        """Forms for this thread."""
+        if isinstance(self.given, Mapping):
+            return self.given
+        build = self.given
+        return self.made.get(
+            threading.get_ident(), lambda: {name: prepare(build(name, plan)) for name, plan in plans.items()}
+        )
+
+
+def _elsewhere(sent: _Sent, experiment: Experiment, samples: Samples, params: Draw) -> Outcome:
     """Outcome of one draw in another process or thread."""
-
-    def forms(given: Forms | Builder) -> Forms:
-        if isinstance(given, Mapping):
-            return given
-        return {name: prepare(given(name, plan)) for name, plan in experiment.plans.items()}
-
-    return _of_forms(shared.made(forms), experiment, params)
+    return _of_forms(sent.forms(experiment.plans), experiment, samples, params)
 
 
 def _nominal(
@@ -351,34 +407,23 @@ def _nominal(
 
 
 def _by_python(
-    account: Account[Outcome],
-    forms: Forms,
-    experiment: Experiment,
+    run: Callable[[Iterable[str], Draw], Outcome],
+    aside: dict[int, Outcome],
     drawn: list[Draw],
-    timeout: float | None,
-    progress: bool,
-) -> Account[Outcome]:
-    """Outcomes, with plans and draws for which CVODES failed run again in this process, if necessary in Python."""
-    failed = {
-        k: [plan for plan, one in outcome.items() if _of_solver(one)]
-        for k, outcome in account.in_order().items()
-        if not isinstance(outcome, Failed) and any(map(_of_solver, outcome.values()))
-    }
-    if not failed:
-        return account
-    found = {k: outcome for k, outcome in account.found.items() if k not in failed}
-    if account.interrupted:
-        return Account(found, True)
+    results: DrawResults,
+    execution: Execution,
+) -> bool:
+    """Run plans and draws for which CVODES failed in this process, if necessary in Python; return if interrupted."""
+    numbers = sorted(aside)
 
-    def run(k: int) -> Outcome:
-        return _outcome(lambda name: forms[name], experiment, failed[k], drawn[k])
+    def again(k: int) -> Outcome:
+        return run([plan for plan, one in aside[k].items() if _of_solver(one)], drawn[k])
 
-    again = executed(run, list(failed), None, timeout, "draws by Python", progress)
-    for i, outcome in again.found.items():
-        k = list(failed)[i]
-        known = account.found[k]
-        found[k] = known | outcome if isinstance(known, dict) and isinstance(outcome, dict) else outcome
-    return Account(found, again.interrupted)
+    def collect(i: int, outcome: Outcome | Failed) -> None:
+        known = aside.pop(numbers[i])
+        results.add(numbers[i], drawn[numbers[i]], outcome if isinstance(outcome, Failed) else known | outcome)
+
+    return executed(OneByOne(again), numbers, collect, execution, "draws by Python").interrupted
 
 
 def _check_read(forms: Mapping[str, Prepared], table: dict[str, Array], start: ArrayLike | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -19,20 +19,15 @@ from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Params
 from ctrlplan.simulation import Event
 from ctrlplan.studies.alike import Linear
+from ctrlplan.studies.batches import Batches
+from ctrlplan.studies.checkpoint import digest
 from ctrlplan.studies.comparison import finite_or_none, shown_in_units
-from ctrlplan.studies.ensemble import Failure
-from ctrlplan.studies.executing import (
-    Account,
-    Executor,
-    Failed,
-    checked_executor,
-    checked_timeout,
-    executed,
-    gathered,
-    tried,
-)
+from ctrlplan.studies.ensemble import Failure, numbers_shown
+from ctrlplan.studies.executing import Executed, Execution, executed
+from ctrlplan.studies.executors import Executor
 from ctrlplan.studies.experiment import Experiment, Metrics
 from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, shown_measures, wanted_measures
+from ctrlplan.studies.outcomes import Failed
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import CONTROL, Builder, System, is_builder
 from ctrlplan.studies.units import (
@@ -69,7 +64,7 @@ class Sweep(Displayed):
     failures : tuple of Failure
         Failed values, with the reason; `Failure.draw` is the index of the value.
     interrupted : bool
-        Whether Ctrl-C ended the sweep; values that did not run are missing.
+        Whether Ctrl-C ended the sweep; values that did not run are not in `values`.
     roles : dict of str to Role
         Role of each plan, if known.
     band : float
@@ -80,6 +75,11 @@ class Sweep(Displayed):
         Labels of the axes of the plans, and of the controls.
     measures : dict of str to Measure
         Titles and units of the metrics.
+    sent_again : tuple of float
+        Values that were sent to an executor again because their worker ended.
+    missing : tuple of float
+        Values that no worker finished, which are in `failures` too, or that did
+        not run before an interruption.
     """
 
     parameter: str
@@ -93,6 +93,8 @@ class Sweep(Displayed):
     axes: tuple[str, ...] = ()
     controls: tuple[str, ...] = ()
     measures: dict[str, Measure] = field(default_factory=lambda: dict(MEASURES))
+    sent_again: tuple[float, ...] = ()
+    missing: tuple[float, ...] = ()
 
     def title_of(self, name: str) -> str:
         """Title of a metric."""
@@ -114,6 +116,8 @@ class Sweep(Displayed):
                 (self.parameter, ends),
                 ("failures", str(len(self.failures)) if self.failures else ""),
                 ("interrupted", "yes: some values were not run" if self.interrupted else ""),
+                ("sent again", numbers_shown(self.sent_again)),
+                ("missing", numbers_shown(self.missing)),
             ]
         )
         yield self.metric_table()
@@ -175,7 +179,11 @@ class Sweep(Displayed):
         moved = [replace(failure, draw=int(place[failure.draw])) for failure in self.failures]
         moved += [replace(failure, draw=int(place[failure.draw + self.values.size])) for failure in other.failures]
         failures = tuple(sorted(moved, key=lambda failure: failure.draw))
+        failed = values[order][[failure.draw for failure in failures]]
         interrupted = self.interrupted or other.interrupted
+        again, missing = (
+            tuple(sorted({*getattr(self, name), *getattr(other, name)})) for name in ("sent_again", "missing")
+        )
         return replace(
             self,
             values=values[order],
@@ -183,6 +191,8 @@ class Sweep(Displayed):
             failures=failures,
             interrupted=interrupted,
             roles=self.roles | other.roles,
+            sent_again=again,
+            missing=tuple(value for value in missing if value not in values or value in failed),
         )
 
     def column(self, plan: str, name: str) -> Array:
@@ -259,6 +269,9 @@ def sweep(
     measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
     units: Mapping[str, str] | None = None,
     executor: Executor | None = None,
+    workers: int | None = None,
+    chunk: int | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
     progress: bool = True,
     timeout: float | None = None,
 ) -> Sweep:
@@ -330,19 +343,20 @@ def sweep(
     >>> found.metrics["step"]["overshoot_error"].round(1)
     array([16.3, 85.4])
     """
-    executor, timeout = checked_executor(executor), checked_timeout(timeout)
+    execution = Execution.from_arguments(locals())
     points = _checked_values(values)
     if not is_builder(build):
         raise TypeError(f"build must be a function of a value that returns a loop, got {type(build).__name__}")
     experiment = Experiment.from_arguments(locals())
-    if executor is None:
-        outcomes = _outcomes(build, points.tolist(), experiment, units, timeout)
-        account = gathered(outcomes, points.size, parameter, progress)
-    else:
-        run = partial(_built, build, experiment, units)
-        account = executed(run, points.tolist(), executor, timeout, parameter, progress)
-        account.raise_if_none_ran("build")
-    found = _swept(parameter, points, account)
+    outcomes: dict[int, Metrics | Failed] = {}
+    runs = _batches(build, experiment, units)
+
+    def identity() -> dict[str, object]:
+        return {"kind": "sweep", "values": digest(points), "units": dict(units or {}), **experiment.identity()}
+
+    done = executed(runs, points.tolist(), outcomes.__setitem__, execution, parameter, identity)
+    done.raise_if_none_ran("build")
+    found = _swept(parameter, points, outcomes, done)
     found = _described(found, experiment, dict(units or {}))
     if found.interrupted:
         text = f"the sweep was interrupted: {found.values.size} of {points.size} values are returned"
@@ -357,10 +371,10 @@ def _checked_values(values: ArrayLike) -> Array:
     return points
 
 
-def _swept(parameter: str, points: Array, account: Account[Metrics]) -> Sweep:
-    found = account.in_order()
+def _swept(parameter: str, points: Array, outcomes: Mapping[int, Metrics | Failed], done: Executed) -> Sweep:
+    found = dict(sorted(outcomes.items()))
     errors = [(i, outcome) for i, outcome in enumerate(found.values()) if isinstance(outcome, Failed)]
-    if errors and len(errors) == len(found) and not account.interrupted:
+    if errors and len(errors) == len(found) and not done.interrupted:
         raise errors[0][1].error
     reached = points[list(found)]
     rows: dict[str, dict[str, Array]] = {}
@@ -370,7 +384,8 @@ def _swept(parameter: str, points: Array, account: Account[Metrics]) -> Sweep:
             for name, value in values.items():
                 row.setdefault(name, np.full(reached.size, np.nan))[i] = value
     failures = tuple(Failure(i, {parameter: float(reached[i])}, failed.message) for i, failed in errors)
-    return Sweep(parameter, reached, rows, failures, account.interrupted)
+    again, missing = (tuple(points[list(numbers)].tolist()) for numbers in (done.sent_again, done.missing))
+    return Sweep(parameter, reached, rows, failures, done.interrupted, sent_again=again, missing=missing)
 
 
 def _described(found: Sweep, experiment: Experiment, units: dict[str, str]) -> Sweep:
@@ -399,6 +414,14 @@ def _controls_in(names: Iterable[Iterable[str]], experiment: Experiment) -> tupl
     return tuple(dict.fromkeys(found))
 
 
+def _batches(
+    build: Callable[[float], System | Builder], experiment: Experiment, units: Mapping[str, str] | None
+) -> Batches[float, Metrics]:
+    """Metrics of the loops of all values."""
+    alike = None if units is not None else partial(_metrics_alike, experiment)
+    return Batches(experiment, build, partial(_metrics, experiment, units), alike)
+
+
 def _metrics(experiment: Experiment, units: Mapping[str, str] | None, loop: System | Builder) -> Metrics:
     """Metrics of one loop."""
     found = experiment.run(loop).whole()
@@ -407,68 +430,9 @@ def _metrics(experiment: Experiment, units: Mapping[str, str] | None, loop: Syst
     return found.metrics
 
 
-def _built(
-    build: Callable[[float], System | Builder],
-    experiment: Experiment,
-    units: Mapping[str, str] | None,
-    value: float,
-) -> Metrics:
-    """Metrics for one value."""
-    return _metrics(experiment, units, build(value))
-
-
-_SAMPLES = 2**19
-"""Maximum number of samples of a signal over all loops that are solved together."""
-
-_FIRST = 4
-"""Number of loops solved together at first; doubled each time, so that an interruption discards few results."""
-
-
-def _outcomes(
-    build: Callable[[float], System | Builder],
-    values: list[float],
-    experiment: Experiment,
-    units: Mapping[str, str] | None,
-    timeout: float | None,
-) -> Generator[tuple[int, Metrics | Failed], None, None]:
-    """Outcome of each value; linear loops of the same structure are solved together.
-
-    The first of these is run separately, which checks the arguments for the loop.
-    """
-    waiting: dict[int, Linear] = {}
-    checked, size = False, _FIRST
-    largest = max(2, _SAMPLES // max(1, experiment.timepts.size))
-
-    def together() -> Iterator[tuple[int, Metrics | Failed]]:
-        nonlocal size
-        try:
-            found = (experiment.run_alike(list(waiting.values())) or []) if waiting else []
-            yield from ((k, one.metrics) for k, one in zip(waiting, found, strict=True))
-        except Exception:  # of one of them: run each separately
-            for k in waiting:
-                yield k, tried(partial(_built, build, experiment, units), values[k], timeout)
-        waiting.clear()
-        size = min(2 * size, largest)
-
-    try:
-        for k, value in enumerate(values):
-            loop = tried(build, value, timeout)
-            linear = None if isinstance(loop, Failed) or units is not None else experiment.numbers_of(loop)
-            if linear is None or not checked:
-                run = partial(_metrics, experiment, units)
-                outcome = loop if isinstance(loop, Failed) else tried(run, loop, timeout)
-                checked = checked or (linear is not None and not isinstance(outcome, Failed))
-                yield k, outcome
-                continue
-            if waiting and not linear.fits(next(iter(waiting.values()))):
-                yield from together()
-            waiting[k] = linear
-            if len(waiting) >= size:
-                yield from together()
-        yield from together()
-    except KeyboardInterrupt:  # results of the loops already built
-        yield from together()
-        raise
+def _metrics_alike(experiment: Experiment, loops: Sequence[Linear]) -> list[Metrics]:
+    """Metrics of linear loops of the same structure."""
+    return [one.metrics for one in experiment.run_alike(loops) or ()]
 
 
 def settling_jumps(values: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_]:
