@@ -17,8 +17,11 @@ R = TypeVar("R")
 _SAMPLES = 2**19
 """Maximum number of samples of a signal over all loops that are solved together."""
 
-_FIRST = 4
+FIRST = 4
 """Number of loops solved together at first; doubled each time, so that an interruption discards few results."""
+
+FIRST_OF_TASK = 32
+"""The same in a task of an executor, which an interruption does not end."""
 
 
 @dataclass
@@ -36,12 +39,15 @@ class Batches(Generic[T, R]):
     alike : callable or None
         Maps linear loops of the same structure to the outcome of each; None if
         every loop is run separately.
+    first : int
+        Number of loops solved together at first.
     """
 
     experiment: Experiment
     build: Callable[[T], System | Builder]
     alone: Callable[[System | Builder], R]
     alike: Callable[[Sequence[Linear]], Sequence[R]] | None
+    first: int = FIRST
     _checked: bool = False
 
     def outcomes(self, values: Sequence[T], timeout: float | None) -> Generator[tuple[int, R | Failed], None, None]:
@@ -51,7 +57,7 @@ class Batches(Generic[T, R]):
         arguments for the loop. After a KeyboardInterrupt, outcomes of loops already built follow.
         """
         waiting: dict[int, Linear] = {}
-        size = _FIRST
+        size = self.first
         largest = max(2, _SAMPLES // max(1, self.experiment.timepts.size))
 
         def together() -> Iterator[tuple[int, R | Failed]]:

@@ -23,7 +23,7 @@ from ctrlplan.simulation import Event, Prepared, SolverError, prepare
 from ctrlplan.simulation.built_forms import NotCompiledError
 from ctrlplan.simulation.methods.delegated import DELEGATED
 from ctrlplan.studies.alike import Linear
-from ctrlplan.studies.batches import Batches
+from ctrlplan.studies.batches import FIRST, FIRST_OF_TASK, Batches
 from ctrlplan.studies.checkpoint import digest
 from ctrlplan.studies.comparison import Comparison, comparison_of
 from ctrlplan.studies.draw_results import DrawResults, Outcome, band_samples
@@ -77,8 +77,8 @@ def monte_carlo(
 ) -> Ensemble:
     """Compare plans in a loop for many draws of its parameters.
 
-    Failures and interruptions are treated as in `sweep`: failed draws are
-    recorded in `Ensemble.failures`.
+    Failures, interruptions and executors are treated as in `sweep`: failed draws
+    are recorded in `Ensemble.failures`.
 
     Parameters
     ----------
@@ -86,7 +86,8 @@ def monte_carlo(
         A loop with the drawn parameters in the ``params`` of its blocks; it is
         prepared once for all draws. Or a function whose arguments have the
         names of the draws: it is called with a value of each by keyword and
-        returns a loop. Any other callable maps the name of a plan and the plan
+        returns a loop; linear loops of the same structure are solved together in
+        closed form. Any other callable maps the name of a plan and the plan
         to a loop, as in `compare`, with the parameters in its blocks.
     draws : mapping of str to array_like, shape (ndraws,)
         Values of each parameter, as the function `draws` makes them.
@@ -94,21 +95,26 @@ def monte_carlo(
         As for `compare`.
     waypoints, start, band, outputs, controls, initial_state, params, events, measures : optional
         As in `Experiment`; a drawn parameter overrides that of `params`.
-    units, executor, progress, timeout : optional
+    units, executor, workers, chunk, checkpoint, progress, timeout : optional
         As for `sweep`. Other processes require a loop that can be compiled, or a
-        function that the executor can pickle.
+        function that the executor can pickle. A checkpoint of a loop with other
+        nominal metrics is rejected.
 
     Returns
     -------
     Ensemble
+        The bands have at most 1001 times, fewer if there are very many draws.
 
     Raises
     ------
     TypeError
         If `executor` has no ``submit``.
+    RuntimeError
+        If a worker has other versions of ctrlplan or casadi.
     ValueError
-        If the numbers of draws differ, a draw is not finite, or no block reads
-        a parameter. An exception of the nominal loop is raised if an argument
+        If the numbers of draws differ, a draw is not finite, no block reads a
+        parameter, the loop cannot be sent to other processes, or the checkpoint
+        is that of another study. An exception of the nominal loop is raised if an argument
         causes it, or if no draw runs.
 
     Warns
@@ -278,7 +284,8 @@ class _Built:
         self, experiment: Experiment, samples: Samples, drawn: list[Draw], elsewhere: bool, timeout: float | None
     ) -> tuple[Runs[Draw, Outcome], Forms | None]:
         build, alone = partial(_with_draw, self.build), partial(_of_loop, experiment, samples)
-        return Batches(experiment, build, alone, partial(_alike, experiment, samples)), None
+        first = FIRST_OF_TASK if elsewhere else FIRST
+        return Batches(experiment, build, alone, partial(_alike, experiment, samples), first), None
 
 
 def _with_draw(build: Callable[..., System], params: Draw) -> System:

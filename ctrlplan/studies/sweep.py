@@ -19,7 +19,7 @@ from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Params
 from ctrlplan.simulation import Event
 from ctrlplan.studies.alike import Linear
-from ctrlplan.studies.batches import Batches
+from ctrlplan.studies.batches import FIRST, FIRST_OF_TASK, Batches
 from ctrlplan.studies.checkpoint import digest
 from ctrlplan.studies.comparison import finite_or_none, shown_in_units
 from ctrlplan.studies.ensemble import Failure, numbers_shown
@@ -278,11 +278,11 @@ def sweep(
     """Compare plans in a loop for each value of a parameter.
 
     A value is recorded in `Sweep.failures` with the reason if its run raises an
-    exception, calls ``sys.exit`` or exceeds the time limit, or if its worker
-    process dies; the sweep continues. Ctrl-C ends the sweep: finished results are
-    returned with a warning, and tasks that have not begun are cancelled; an
-    executor finishes those that have. A second Ctrl-C, or one before the first
-    result of `monte_carlo`, raises KeyboardInterrupt.
+    exception, calls ``sys.exit`` or exceeds the time limit; the sweep continues.
+    Ctrl-C ends the sweep: finished results are returned with a warning, and tasks
+    that have not begun are cancelled; an executor finishes those that have. A
+    second Ctrl-C, or one before the first result of `monte_carlo`, raises
+    KeyboardInterrupt.
 
     Parameters
     ----------
@@ -303,8 +303,20 @@ def sweep(
         Where the comparisons run: an object with ``submit`` whose result has
         ``result``, as of `dask.distributed`, `loky` or `mpi4py.futures`; not a
         `multiprocessing.Pool`. Other processes require a `build` that the
-        executor can pickle. Without an executor, linear loops of the same
-        structure are solved and measured together, which is much faster.
+        executor can pickle. Linear loops of the same structure are solved and
+        measured together, which is much faster than one by one.
+    workers : int, optional
+        Number of workers of the executor, if it does not state one: at most twice
+        as many tasks are in flight. If the number is not known, all tasks are
+        submitted at the beginning.
+    chunk : int, optional
+        Number of values of a task; by default at most 250, fewer if a worker
+        would have less than four tasks. A task returns after a second what it has
+        not run, unless `build` or a run does not return.
+    checkpoint : path, optional
+        Folder of finished values, which is made if needed. A second call with the
+        same values and options runs only what is missing. Failures are run again.
+        `build` is not compared: use a new folder after a change of the loop.
     progress : bool, optional
         Whether a progress bar is shown on stderr.
     timeout : float, optional
@@ -322,8 +334,11 @@ def sweep(
     TypeError
         If `executor` has no ``submit``, or `build` is not a function.
     ValueError
-        If the values are not finite or do not increase. If all values fail, the
-        first exception is raised, SystemExit as a RuntimeError.
+        If the values are not finite or do not increase, `build` cannot be sent to
+        other processes, or the checkpoint is that of another study. If all values
+        fail, the first exception is raised, SystemExit as a RuntimeError.
+    RuntimeError
+        If a worker has other versions of ctrlplan or casadi.
 
     Warns
     -----
@@ -333,6 +348,35 @@ def sweep(
     See Also
     --------
     monte_carlo : Random draws of several parameters.
+
+    Notes
+    -----
+    The loop is sent to each worker once, a task has its values only. Values of a
+    task whose worker ends are sent again, twice at most, one at a time, so that
+    only the value that ends its worker has no result: see `Sweep.sent_again` and
+    `Sweep.missing`. A broken `concurrent.futures.ProcessPoolExecutor` is replaced
+    by one of the same size and start method. Nothing runs in this process
+    instead. Results differ from those without an executor by rounding errors,
+    1e-14 of the largest value.
+
+    On a dask cluster, with `build` and `values` in a module ``study``::
+
+        from dask.distributed import Client
+        import ctrlplan as cp, study
+        if __name__ == "__main__":
+            with Client("tcp://scheduler:8786") as client:
+                cp.sweep(study.build, study.values, study.plans, study.timepts, executor=client)
+
+    With MPI, the script takes ``executor=mpi4py.futures.MPIPoolExecutor()`` and is
+    started with one process for itself and one for each worker::
+
+        mpiexec -n 65 python -m mpi4py.futures study.py
+
+    With ray, the executor is an object of the class::
+
+        class Ray:
+            def submit(self, function, task):
+                return ray.remote(function).remote(task).future()
 
     Examples
     --------
@@ -349,7 +393,9 @@ def sweep(
         raise TypeError(f"build must be a function of a value that returns a loop, got {type(build).__name__}")
     experiment = Experiment.from_arguments(locals())
     outcomes: dict[int, Metrics | Failed] = {}
-    runs = _batches(build, experiment, units)
+    alike = None if units is not None else partial(_metrics_alike, experiment)
+    first = FIRST if executor is None else FIRST_OF_TASK
+    runs = Batches(experiment, build, partial(_metrics, experiment, units), alike, first)
 
     def identity() -> dict[str, object]:
         return {"kind": "sweep", "values": digest(points), "units": dict(units or {}), **experiment.identity()}
@@ -412,14 +458,6 @@ def _controls_in(names: Iterable[Iterable[str]], experiment: Experiment) -> tupl
     stems = [f"{name}_" for name, one in wanted_measures(experiment.measures).items() if one.of == "control"]
     found = (key.removeprefix(stem) for row in names for key in row for stem in stems if key.startswith(stem))
     return tuple(dict.fromkeys(found))
-
-
-def _batches(
-    build: Callable[[float], System | Builder], experiment: Experiment, units: Mapping[str, str] | None
-) -> Batches[float, Metrics]:
-    """Metrics of the loops of all values."""
-    alike = None if units is not None else partial(_metrics_alike, experiment)
-    return Batches(experiment, build, partial(_metrics, experiment, units), alike)
 
 
 def _metrics(experiment: Experiment, units: Mapping[str, str] | None, loop: System | Builder) -> Metrics:
