@@ -18,6 +18,9 @@ _SAMPLES = (31, 1001)
 _NUMBERS = 2**25
 """Maximum number of samples of all signals of all draws, from which the bands are computed."""
 
+_NUMBERS_OF_DRAW = 2**13
+"""Maximum number of samples of all signals of one draw."""
+
 _COLUMNS = 64
 """Number of times whose quantiles are computed together."""
 
@@ -114,8 +117,9 @@ def _quantiles(rows: Array) -> Array:
     return out
 
 
-def band_samples(times: Array, curves: int) -> NDArray[np.intp]:
-    """Indices of the samples of the bands, fewer for many curves: signals of all plans and draws."""
+def band_samples(times: Array, draws: int, curves: int) -> NDArray[np.intp]:
+    """Indices of the samples of the bands: fewer for many draws and for many curves of each."""
     low, high = _SAMPLES
-    count = min(times.size, high, max(low, _NUMBERS // max(1, curves)))
+    numbers = min(_NUMBERS_OF_DRAW, _NUMBERS // max(1, draws))
+    count = min(times.size, high, max(low, numbers // max(1, curves)))
     return np.unique(np.linspace(0, times.size - 1, count).round().astype(np.intp))

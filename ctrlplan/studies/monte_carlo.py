@@ -103,7 +103,7 @@ def monte_carlo(
     Returns
     -------
     Ensemble
-        The bands have at most 1001 times, fewer if there are very many draws.
+        The bands have at most 1001 times, fewer for very many draws or signals.
 
     Raises
     ------
@@ -139,8 +139,8 @@ def monte_carlo(
     drawn_loop: _Drawn = _Built(loop) if _is_of_draws(loop, table) else _Prepared.of(loop, experiment, table)
     nominal, nominal_draw = _nominal(drawn_loop, experiment, table, units, timeout)
     drawn = [_draw(table, k) for k in range(_count(table))]
-    curves = len(drawn) * len(experiment.plans) * len({*nominal.outputs, *nominal.controls})
-    samples = band_samples(experiment.timepts, curves)
+    curves = len(experiment.plans) * len({*nominal.outputs, *nominal.controls})
+    samples = band_samples(experiment.timepts, len(drawn), curves)
     runs, again = drawn_loop.runs(experiment, samples, drawn, executor is not None, timeout)
     shown = shown_measures(experiment.measures, list(nominal.metrics.values()))
     results = DrawResults(len(drawn), experiment.timepts[samples], shown.keys() - nominal.measures.keys())

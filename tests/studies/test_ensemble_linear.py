@@ -109,7 +109,7 @@ def test_bands_have_fewer_times_for_very_many_draws():
     from ctrlplan.studies.draw_results import band_samples
 
     times = np.linspace(0.0, 10.0, 3456)
-    for curves, count in ((1, 1001), (10**4, 1001), (6 * 10**5, 55), (10**8, 31)):
-        found = band_samples(times, curves)
+    for draws, curves, count in ((1, 1, 1001), (1000, 8, 1001), (10, 20, 409), (10**5, 6, 55), (10**6, 20, 31)):
+        found = band_samples(times, draws, curves)
         assert found.size == count
         assert found[[0, -1]].tolist() == [0, 3455]
