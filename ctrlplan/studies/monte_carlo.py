@@ -113,9 +113,10 @@ def monte_carlo(
         If a worker has other versions of ctrlplan or casadi.
     ValueError
         If the numbers of draws differ, a draw is not finite, no block reads a
-        parameter, the loop cannot be sent to other processes, or the checkpoint
-        is that of another study. An exception of the nominal loop is raised if an argument
-        causes it, or if no draw runs.
+        parameter, a function returns loops with different outputs, the loop
+        cannot be sent to other processes, or the checkpoint is that of another
+        study. An exception of the nominal loop is raised if an argument causes
+        it, or if no draw runs.
 
     Warns
     -----
@@ -145,8 +146,10 @@ def monte_carlo(
     shown = shown_measures(experiment.measures, list(nominal.metrics.values()))
     results = DrawResults(len(drawn), experiment.timepts[samples], shown.keys() - nominal.measures.keys())
     aside: dict[int, Outcome] = {}
+    signals: dict[str, tuple[str, ...]] = {}
 
     def collect(k: int, outcome: Outcome | Failed) -> None:
+        _check_signals(signals, k, outcome)
         if again is not None and not isinstance(outcome, Failed) and any(map(_of_solver, outcome.values())):
             aside[k] = outcome
         else:
@@ -411,6 +414,20 @@ def _nominal(
     assert own is not None  # noqa: S101 (there is a draw, and it failed)
     own.error.add_note("with the nominal parameters of the loop, and with the first draws")
     raise own.error
+
+
+def _check_signals(signals: dict[str, tuple[str, ...]], k: int, outcome: Outcome | Failed) -> None:
+    """Raise if a draw has other signals than those before it."""
+    for plan, found in outcome.items() if not isinstance(outcome, Failed) else ():
+        if isinstance(found, Failed):
+            continue
+        names = tuple(found[1])
+        known = signals.setdefault(plan, names)
+        if names != known:
+            raise ValueError(
+                f"loop must return loops with the same outputs and controls for all draws, got {', '.join(names)} for "
+                f"draw {k} and {', '.join(known)} for others, with the plan {plan}; give outputs= and controls="
+            )
 
 
 def _by_python(

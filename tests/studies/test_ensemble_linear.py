@@ -113,3 +113,17 @@ def test_bands_have_fewer_times_for_very_many_draws():
         found = band_samples(times, draws, curves)
         assert found.size == count
         assert found[[0, -1]].tolist() == [0, 3455]
+
+
+@pytest.mark.parametrize("executor", [None, lambda: ThreadPoolExecutor(2)], ids=["here", "threads"])
+def test_loops_with_different_outputs_are_an_error(executor):
+    def build(gain):
+        outputs = ["y"] if gain < 3.0 else ["z"]
+        return ct.ss([[-gain]], [[gain]], [[1.0]], [[0.0]], inputs="r", outputs=outputs)
+
+    said = (
+        "loop must return loops with the same outputs and controls for all draws, got [yz] for draw [0-3] and [yz] for"
+    )
+    with pytest.raises(ValueError, match=said):
+        run(build, {"gain": [1.0, 2.0, 4.0, 2.5]}, executor and executor())
+    run(build, {"gain": [1.0, 2.0]})

@@ -1,7 +1,9 @@
 """Tasks of executors: their sizes, how many are in flight, what travels to a worker, versions of packages."""
 
 import pickle
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
 from types import SimpleNamespace
 
 import control as ct
@@ -10,7 +12,7 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan._lru import Lru
-from ctrlplan.studies import chunks, dispatch
+from ctrlplan.studies import chunks, dispatch, executors
 
 TIMES = np.linspace(0.0, 10.0, 101)
 PLANS = {"step": cp.Step(1.0)}
@@ -206,3 +208,72 @@ def test_futures_are_dropped_once_they_are_read(monkeypatch):
     swept(executor, chunk=1)
     assert executor.most_alive <= 5
     assert executor.alive == 0
+
+
+# Process pools that break
+
+
+def test_a_new_pool_has_the_size_and_start_method_of_the_broken_one():
+    context = get_context("spawn")
+    with ProcessPoolExecutor(3, mp_context=context, initializer=print, initargs=(1,), max_tasks_per_child=7) as pool:
+        new = executors.new_pool(pool)
+        names = ("_max_workers", "_mp_context", "_initializer", "_initargs", "_max_tasks_per_child")
+        assert [getattr(new, name) for name in names] == [3, context, print, (1,), 7]
+        new.shutdown()
+    assert executors.new_pool(ThreadPoolExecutor(1)) is None
+
+
+class Breaking(Workers):
+    """Pool whose worker ends at some values; it then takes no more tasks, and all that it has are lost."""
+
+    _max_workers = 2
+
+    def __init__(self, killers, monkeypatch):
+        super().__init__(2, monkeypatch)
+        self.killers, self.broken, self.ended = killers, False, 0
+
+    def submit(self, function, task):
+        if self.broken:
+            raise BrokenProcessPool("takes no more")
+        return super().submit(function, task)
+
+    def run(self, k):
+        _, task = pickle.loads(self.sent[k])
+        self.broken |= bool(self.killers & set(task._values))
+        if self.broken:
+            raise BrokenProcessPool("ended")
+        return super().run(k)
+
+    def shutdown(self, **options):
+        assert options == {"wait": False, "cancel_futures": True}
+        self.ended += 1
+
+
+@pytest.mark.parametrize("killers", [set(), {RATES[7]}, {RATES[0], RATES[1], RATES[39]}])
+def test_a_broken_pool_is_replaced_and_only_the_values_that_broke_it_are_missing(killers, monkeypatch):
+    pools = [Breaking(killers, monkeypatch)]
+
+    def new_pool(broken):
+        assert broken is pools[-1]
+        assert broken.broken
+        pools.append(Breaking(killers, monkeypatch))
+        return pools[-1]
+
+    monkeypatch.setattr(dispatch, "new_pool", new_pool)
+    found = cp.sweep(lag, RATES, PLANS, TIMES, executor=pools[0], progress=False, measures=["settling_time"])
+    assert found.missing == tuple(sorted(killers))
+    assert [failure.params["value"] for failure in found.failures] == sorted(killers)
+    expected = np.where(np.isin(RATES, list(killers)), np.nan, np.log(50.0) / RATES)
+    np.testing.assert_allclose(found.metrics["step"]["settling_time"], expected, rtol=1e-4)
+    assert len(pools) <= 1 + 3 * len(killers)
+    assert [pool.ended for pool in pools] == [0] + [1] * (len(pools) - 1)  # the first belongs to the caller
+    assert max(pool.most for pool in pools) <= 4
+
+
+def test_a_broken_executor_that_is_no_process_pool_keeps_what_it_has_finished(monkeypatch):
+    pool = Breaking({RATES[20]}, monkeypatch)
+    found = cp.sweep(lag, RATES, PLANS, TIMES, executor=pool, progress=False, measures=["settling_time"])
+    finished = np.isfinite(found.metrics["step"]["settling_time"])
+    assert finished[:20].all()
+    assert not finished[25:].any()
+    assert found.missing == tuple(RATES[~finished])
