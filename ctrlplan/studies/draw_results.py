@@ -52,7 +52,13 @@ class DrawResults:
         self._count = count
 
     def add(self, k: int, params: dict[str, float], outcome: Outcome | Failed) -> None:
-        """Add the outcome of one draw, in any order."""
+        """Add the outcome of one draw, in any order.
+
+        Raises
+        ------
+        ValueError
+            If it has other signals than those before it.
+        """
         self.finished += 1
         if isinstance(outcome, Failed):
             self._failures.append(Failure(k, params, outcome.message))
@@ -66,6 +72,7 @@ class DrawResults:
                 self._failures.append(Failure(k, params, found.message, plan))
                 continue
             metrics, signals = found
+            rows = self._signals_of(plan, k, tuple(signals))
             columns, names = self._metrics.setdefault(plan, {}), self._names.setdefault(plan, {})
             listed = tuple(metrics)
             names[listed] = min(k, names.get(listed, k))
@@ -75,10 +82,19 @@ class DrawResults:
                 if name not in self._mixed:
                     columns[name][k] = value
             for name, curve in signals.items():
-                known = self._signals.setdefault(plan, {})
-                if name not in known:
-                    known[name] = np.full((self._count, self.timepts.size), np.nan)
-                known[name][k, : curve.size] = curve
+                rows[name][k, : curve.size] = curve
+
+    def _signals_of(self, plan: str, k: int, names: tuple[str, ...]) -> dict[str, Array]:
+        """Signals (ndraws, ntime) of all draws with a plan, those of another draw checked."""
+        if plan not in self._signals:
+            self._signals[plan] = {name: np.full((self._count, self.timepts.size), np.nan) for name in names}
+        rows = self._signals[plan]
+        if names != tuple(rows):
+            raise ValueError(
+                f"loop must return loops with the same outputs and controls for all draws, got {', '.join(names)} for "
+                f"draw {k} and {', '.join(rows)} for others, with the plan {plan}; give outputs= and controls="
+            )
+        return rows
 
     def failures(self) -> tuple[Failure, ...]:
         """Failures in the order of the draws."""

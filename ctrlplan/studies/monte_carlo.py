@@ -145,29 +145,19 @@ def monte_carlo(
     runs, again = drawn_loop.runs(experiment, samples, drawn, executor is not None, timeout)
     shown = shown_measures(experiment.measures, list(nominal.metrics.values()))
     results = DrawResults(len(drawn), experiment.timepts[samples], shown.keys() - nominal.measures.keys())
-    aside: dict[int, Outcome] = {}
-    signals: dict[str, tuple[str, ...]] = {}
-
-    def collect(k: int, outcome: Outcome | Failed) -> None:
-        _check_signals(signals, k, outcome)
-        if again is not None and not isinstance(outcome, Failed) and any(map(_of_solver, outcome.values())):
-            aside[k] = outcome
-        else:
-            results.add(k, drawn[k], outcome)
+    collected = _Collected(drawn, results, again is not None)
 
     def identity() -> dict[str, object]:
         tables = {name: digest(values) for name, values in table.items()}
         own = {"kind": "monte_carlo", "draws": tables, "loop": nominal.metrics, "units": dict(units or {})}
         return own | experiment.identity()
 
-    done = executed(runs, drawn, collect, execution, "draws", identity)
+    done = executed(runs, drawn, collected.add, execution, "draws", identity)
     done.raise_if_none_ran("the loop")
-    interrupted, missing = done.interrupted, set(done.missing)
-    if again is not None and aside:
-        if not interrupted:
-            here = replace(execution, executor=None, workers=None, checkpoint=None)
-            interrupted = _by_python(partial(_outcome, again, experiment, samples), aside, drawn, results, here)
-        missing |= aside.keys()
+    interrupted = done.interrupted
+    if again is not None and collected.aside and not interrupted:
+        here = replace(execution, executor=None, workers=None, checkpoint=None)
+        interrupted = collected.run_again(partial(_outcome, again, experiment, samples), here)
     if interrupted:
         text = f"monte_carlo was interrupted: {results.finished} of {_count(table)} draws are returned"
         warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())
@@ -182,7 +172,7 @@ def monte_carlo(
         nominal_draw=nominal_draw,
         interrupted=interrupted,
         sent_again=done.sent_again,
-        missing=tuple(sorted(missing)),
+        missing=tuple(sorted({*done.missing, *collected.aside})),
     )
 
 
@@ -252,6 +242,49 @@ def _outcome(
         return metrics, {name: run.signals[name][stored] for name in names}
 
     return {plan: tried(measured, plan) for plan in plans}
+
+
+@dataclass(frozen=True)
+class _Collected:
+    """Outcomes of draws as they arrive.
+
+    Attributes
+    ----------
+    drawn : list of dict
+        The draws.
+    results : DrawResults
+        Results of all draws.
+    compiled : bool
+        Whether draws whose solver failed are to be run again by another method.
+    aside : dict of int to Outcome
+        Outcomes of these draws.
+    """
+
+    drawn: list[Draw]
+    results: DrawResults
+    compiled: bool
+    aside: dict[int, Outcome] = field(default_factory=dict)
+
+    def add(self, k: int, outcome: Outcome | Failed) -> None:
+        """Add the outcome of a draw."""
+        if self.compiled and not isinstance(outcome, Failed) and any(map(_of_solver, outcome.values())):
+            self.aside[k] = outcome
+        else:
+            self.results.add(k, self.drawn[k], outcome)
+
+    def run_again(self, run: Callable[[Iterable[str], Draw], Outcome], execution: Execution) -> bool:
+        """Run plans for which CVODES failed in this process, if necessary in Python; return whether interrupted."""
+        numbers = sorted(self.aside)
+
+        def again(k: int) -> Outcome:
+            return run([plan for plan, one in self.aside[k].items() if _of_solver(one)], self.drawn[k])
+
+        def collect(i: int, outcome: Outcome | Failed) -> None:
+            known = self.aside.pop(numbers[i])
+            whole = outcome if isinstance(outcome, Failed) else known | outcome
+            self.results.add(numbers[i], self.drawn[numbers[i]], whole)
+
+        return executed(OneByOne(again), numbers, collect, execution, "draws by Python").interrupted
 
 
 class _Drawn(Protocol):
@@ -414,40 +447,6 @@ def _nominal(
     assert own is not None  # noqa: S101 (there is a draw, and it failed)
     own.error.add_note("with the nominal parameters of the loop, and with the first draws")
     raise own.error
-
-
-def _check_signals(signals: dict[str, tuple[str, ...]], k: int, outcome: Outcome | Failed) -> None:
-    """Raise if a draw has other signals than those before it."""
-    for plan, found in outcome.items() if not isinstance(outcome, Failed) else ():
-        if isinstance(found, Failed):
-            continue
-        names = tuple(found[1])
-        known = signals.setdefault(plan, names)
-        if names != known:
-            raise ValueError(
-                f"loop must return loops with the same outputs and controls for all draws, got {', '.join(names)} for "
-                f"draw {k} and {', '.join(known)} for others, with the plan {plan}; give outputs= and controls="
-            )
-
-
-def _by_python(
-    run: Callable[[Iterable[str], Draw], Outcome],
-    aside: dict[int, Outcome],
-    drawn: list[Draw],
-    results: DrawResults,
-    execution: Execution,
-) -> bool:
-    """Run plans and draws for which CVODES failed in this process, if necessary in Python; return if interrupted."""
-    numbers = sorted(aside)
-
-    def again(k: int) -> Outcome:
-        return run([plan for plan, one in aside[k].items() if _of_solver(one)], drawn[k])
-
-    def collect(i: int, outcome: Outcome | Failed) -> None:
-        known = aside.pop(numbers[i])
-        results.add(numbers[i], drawn[numbers[i]], outcome if isinstance(outcome, Failed) else known | outcome)
-
-    return executed(OneByOne(again), numbers, collect, execution, "draws by Python").interrupted
 
 
 def _check_read(forms: Mapping[str, Prepared], table: dict[str, Array], start: ArrayLike | None) -> None:
