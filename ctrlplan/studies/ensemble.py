@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,6 +30,9 @@ Array = NDArray[np.float64]
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Levels of the quantiles."""
 
+_SHOWN = 8
+"""Maximum number of draws or values in a list."""
+
 
 @dataclass(frozen=True)
 class Failure:
@@ -51,6 +54,12 @@ class Failure:
     params: dict[str, float]
     message: str
     plan: str = ""
+
+
+def numbers_shown(numbers: Sequence[float]) -> str:
+    """The first of some numbers, and how many there are; empty for none."""
+    shown = ", ".join(number(value) for value in numbers[:_SHOWN])
+    return shown if len(numbers) <= _SHOWN else f"{shown}, ... ({len(numbers)} in all)"
 
 
 @dataclass(frozen=True, repr=False)
@@ -79,6 +88,11 @@ class Ensemble(Displayed):
         Draw in place of the nominal loop, if that does not run.
     interrupted : bool
         Whether Ctrl-C ended the runs.
+    sent_again : tuple of int
+        Draws that were sent to an executor again because their worker ended.
+    missing : tuple of int
+        Draws that no worker finished, which are in `failures` too, or that did
+        not run before an interruption.
     """
 
     nominal: Comparison
@@ -91,6 +105,8 @@ class Ensemble(Displayed):
     finished: int = 0
     nominal_draw: int | None = None
     interrupted: bool = False
+    sent_again: tuple[int, ...] = ()
+    missing: tuple[int, ...] = ()
 
     def _describe(self) -> Iterator[Part]:
         failed = counted(len(self.failures), "failure")
@@ -98,7 +114,14 @@ class Ensemble(Displayed):
         yield f"Ensemble of {', '.join(self.nominal.plans)} over {draws}; {failed}"
         ranges = {name: (float(values.min()), float(values.max())) for name, values in self.params.items()}
         rows = [(name, f"{number(low)} to {number(high)}") for name, (low, high) in ranges.items()]
-        yield Facts([*rows, ("interrupted", f"{self.finished} of {self.ndraws} draws run" if self.interrupted else "")])
+        yield Facts(
+            [
+                *rows,
+                ("interrupted", f"{self.finished} of {self.ndraws} draws run" if self.interrupted else ""),
+                ("sent again", numbers_shown(self.sent_again)),
+                ("missing", numbers_shown(self.missing)),
+            ]
+        )
         yield self.metric_table()
         if self.failures:
             yield f"First failure: draw {self.failures[0].draw}: {self.failures[0].message}"
@@ -198,6 +221,8 @@ class Ensemble(Displayed):
         yield f"{self.finished} draws: {ranges}. The responses below are those of {whose}."
         if self.finished < self.ndraws:
             yield f"The run was interrupted; {self.ndraws - self.finished} draws were not run."
+        if self.sent_again:
+            yield f"Draws sent again because their worker ended: {numbers_shown(self.sent_again)}."
         if self.failures:
             first = self.failures[0]
             where = ", ".join(f"{key} = {value:.4g}" for key, value in first.params.items())

@@ -1,108 +1,103 @@
-"""Execution of many runs, in this process or on an executor: progress, interruption, failures."""
+"""Execution of many runs, in this process or on an executor: progress, interruption, checkpoints, failures."""
 
 from __future__ import annotations
 
 import math
-import pickle
-import signal
-import threading
-from asyncio import CancelledError
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from contextvars import ContextVar
+import os
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from numbers import Real
-from queue import Empty, SimpleQueue
-from types import FrameType
-from typing import Any, Generic, Protocol, TypeVar
-from uuid import uuid4
+from operator import index
+from typing import Any, Generic, TypeVar
 
-from ctrlplan._lru import Lru
-from ctrlplan.simulation.budget import time_limit
+from ctrlplan.studies.checkpoint import Checkpoint
+from ctrlplan.studies.dispatch import LARGEST, Dispatch, task_size
+from ctrlplan.studies.executors import CANNOT_BE_SENT, Executor, checked_executor
+from ctrlplan.studies.interruption import counting_interruptions
+from ctrlplan.studies.outcomes import Failed, Runs, ready
 from ctrlplan.studies.progress import bar
 
 T = TypeVar("T")
 R = TypeVar("R")
-R_co = TypeVar("R_co", covariant=True)
-
-_POLL = 0.02
-"""Polling interval of futures without callbacks [s]."""
-
-_POLL_WITH_CALLBACKS = 0.5
-"""Polling interval of futures with callbacks [s]; a callback may not arrive if a connection fails."""
-
-_CACHED = 2
-"""Number of shared values that a thread caches."""
-
-
-class Future(Protocol[R_co]):
-    """Pending result of a call; further methods of a future are used if present."""
-
-    def result(self) -> R_co:
-        """Return the result of the call, or raise its exception."""
-
-
-class Executor(Protocol):
-    """Object that runs tasks, such as `concurrent.futures.Executor`."""
-
-    def submit(self, function: Callable[[T], R], argument: T, /) -> Future[R]:
-        """Submit a call and return its future."""
 
 
 @dataclass(frozen=True)
-class Failed:
-    """Failure of a task.
+class Execution:
+    """Where and how runs are executed.
 
     Attributes
     ----------
-    message : str
-        Message of the exception, with its type.
-    error : Exception
-        The exception. From another process, a RuntimeError in place of one
-        that cannot be pickled.
-    by_executor : bool
-        Whether the executor raised it; the task may not have run at all.
+    executor : Executor or None
+        Where they run; None for this process.
+    workers, chunk : int or None
+        Number of workers of the executor, and number of values of a task; None
+        to choose them.
+    checkpoint : path or None
+        Folder of finished outcomes.
+    progress : bool
+        Whether a progress bar is shown on stderr.
+    timeout : float or None
+        Time limit of one value [s].
+
+    Raises
+    ------
+    TypeError
+        If the executor has no method ``submit``.
+    ValueError
+        If a number is not above 0, or `workers` is given without an executor.
     """
 
-    message: str
-    error: Exception
-    by_executor: bool = False
+    executor: Executor | None = None
+    workers: int | None = None
+    chunk: int | None = None
+    checkpoint: str | os.PathLike[str] | None = None
+    progress: bool = False
+    timeout: float | None = None
+
+    def __post_init__(self) -> None:
+        checked_executor(self.executor)
+        checked_timeout(self.timeout)
+        for name in ("workers", "chunk"):
+            _check_count(getattr(self, name), name)
+        if self.workers is not None and self.executor is None:
+            raise ValueError(
+                f"workers must be None without an executor, got {self.workers}; for several processes give "
+                f"executor=concurrent.futures.ProcessPoolExecutor({self.workers})"
+            )
+        if self.checkpoint is not None and not isinstance(self.checkpoint, str | os.PathLike):
+            raise TypeError(f"checkpoint must be the path of a folder, or None, got {self.checkpoint!r:.80}")
 
     @classmethod
-    def of(cls, error: BaseException, by_executor: bool = False) -> Failed:
-        """Failure with an exception; SystemExit becomes a RuntimeError."""
-        message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        return cls(message, error if isinstance(error, Exception) else RuntimeError(message), by_executor)
-
-    def __reduce__(self) -> tuple[object, ...]:
-        """Pickle without an exception that cannot be pickled, which would break a whole pool."""
-        error = self.error
-        try:
-            picklable = type(pickle.loads(pickle.dumps(error))) is type(error)  # noqa: S301 (pickled here)
-        except Exception:  # of the constructor of an exception
-            picklable = False
-        return Failed, (self.message, error if picklable else RuntimeError(self.message), self.by_executor)
+    def from_arguments(cls, given: Mapping[str, Any]) -> Execution:
+        """Execution from the arguments of a function that has all its fields, by name."""
+        return cls(**{name: given[name] for name in cls.__dataclass_fields__})
 
 
-@dataclass
-class Account(Generic[R]):
-    """Results and failures by the number of the task.
+@dataclass(frozen=True)
+class Executed:
+    """What became of the values that were to be run.
 
     Attributes
     ----------
-    found : dict of int to result or Failed
-        In the order of completion.
+    finished : int
+        Number of values that ran or failed.
     interrupted : bool
-        Whether Ctrl-C ended the execution; tasks that did not run are missing.
+        Whether Ctrl-C ended the execution.
+    sent_again : tuple of int
+        Values that were sent again because their worker ended.
+    missing : tuple of int
+        Values that no worker finished, or that did not run.
+    errors : tuple of Exception
+        Exceptions of the executor, one for each value that no worker finished.
     """
 
-    found: dict[int, R | Failed] = field(default_factory=dict)
-    interrupted: bool = False
-
-    def in_order(self) -> dict[int, R | Failed]:
-        """Results and failures, in the order of the tasks."""
-        return dict(sorted(self.found.items()))
+    finished: int
+    interrupted: bool
+    sent_again: tuple[int, ...]
+    missing: tuple[int, ...]
+    errors: tuple[Exception, ...]
 
     def raise_if_none_ran(self, what: str) -> None:
         """Raise the exception of the executor if it ran no task.
@@ -119,35 +114,74 @@ class Account(Generic[R]):
         Exception
             Any other exception of the executor.
         """
-        errors = [found.error for found in self.found.values() if isinstance(found, Failed) and found.by_executor]
-        if self.interrupted or not errors or len(errors) < len(self.found):
+        errors = self.errors
+        if self.interrupted or not errors or len(errors) < self.finished:
             return
-        if isinstance(errors[0], pickle.PicklingError | TypeError | AttributeError):
-            raise ValueError(
-                f"{what} must be picklable for other processes, got {errors[0]}; give a function that builds it at "
-                "the top level of a module, or an executor that pickles any function (dask, loky) or uses threads"
-            ) from errors[0]
+        advice = (
+            "move the builder into a module that the workers can import, or use an executor that pickles any function "
+            "(dask, loky) or threads"
+        )
+        if isinstance(errors[0], CANNOT_BE_SENT):
+            raise ValueError(f"{what} must be picklable for other processes, got {errors[0]}; {advice}") from errors[0]
+        if isinstance(errors[0], BrokenExecutor):
+            errors[0].add_note(
+                f"Every worker process ended. If {what} is defined in a notebook or a console: {advice}."
+            )
         raise errors[0]
 
 
-def checked_executor(executor: Executor | None) -> Executor | None:
-    """Executor, or None for this process.
+def executed(
+    runs: Runs[T, R],
+    values: Sequence[T],
+    collect: Callable[[int, R | Failed], object],
+    execution: Execution,
+    label: str,
+    identity: Callable[[], Mapping[str, object]] = dict,
+) -> Executed:
+    """Run all values, until the last or until Ctrl-C.
+
+    Parameters
+    ----------
+    runs : Runs
+        What is run.
+    values : sequence
+        Arguments of the runs.
+    collect : callable
+        Receives the number and outcome of each value, in the order of completion.
+    execution : Execution
+        Where and how the values are run.
+    label : str
+        Label of the progress bar.
+    identity : callable, optional
+        Returns plain data that identify the outcomes, for a checkpoint.
 
     Raises
     ------
-    TypeError
-        If it has no method ``submit``.
+    ValueError
+        If the checkpoint is that of another study.
     """
-    if executor is None or (callable(getattr(executor, "submit", None)) and not isinstance(executor, type)):
-        return executor
-    kind = f"{type(executor).__module__}.{type(executor).__qualname__}"
-    if hasattr(executor, "apply_async"):
-        raise TypeError(
-            f"executor must have submit, got {kind}, which does not report a worker that dies; "
-            "use concurrent.futures.ProcessPoolExecutor or ThreadPoolExecutor"
-        )
-    given = f"the class {executor.__qualname__} itself" if isinstance(executor, type) else f"{executor!r:.80}"
-    raise TypeError(f"executor must be an object with submit, as those of concurrent.futures, got {given}")
+    store = None if execution.checkpoint is None else Checkpoint.opened(execution.checkpoint, identity())
+    account = _Account(collect)
+    for number, outcome in store.read() if store else ():
+        account.add(number, outcome)
+    numbers = [number for number in range(len(values)) if number not in account.seen]
+    size, dispatch, executor = execution.chunk or LARGEST, None, execution.executor
+    if executor is None or not numbers:
+        outcomes = runs.outcomes([values[number] for number in numbers], execution.timeout)
+        account.numbers = numbers
+    else:
+        size = task_size(len(numbers), executor, execution.workers, execution.chunk)
+        dispatch = Dispatch(runs, values, numbers, executor, execution.workers, size, execution.timeout)
+        outcomes = dispatch.outcomes()
+    with closing(outcomes), store.keeping(size) if store else nullcontext() as account.keep:
+        interrupted = _gathered(outcomes, account, len(values), label, execution.progress)
+    return Executed(
+        len(account.seen),
+        interrupted,
+        tuple(sorted(dispatch.sent_again)) if dispatch else (),
+        tuple(sorted(account.lost.keys() | (set(numbers) - account.seen))),
+        tuple(account.lost.values()),
+    )
 
 
 def checked_timeout(timeout: object) -> float | None:
@@ -165,260 +199,73 @@ def checked_timeout(timeout: object) -> float | None:
     return float(timeout)
 
 
-def tried(run: Callable[[T], R], task: T, timeout: float | None = None) -> R | Failed:
-    """Result of a task, or its failure; only KeyboardInterrupt is raised."""
-    _raise_if_pressed()
-    outcome: R | Failed
-    try:
-        with time_limit(timeout):
-            outcome = run(task)
-    except (Exception, SystemExit) as error:  # of a user's function
-        outcome = Failed.of(error)
-    _raise_if_pressed()  # a solver or a block may have caught the KeyboardInterrupt
-    return outcome
+@dataclass
+class _Account(Generic[R]):
+    """Outcomes as they arrive.
 
-
-def gathered(
-    outcomes: Generator[tuple[int, R | Failed], None, None], count: int, label: str, progress: bool
-) -> Account[R]:
-    """Outcomes of tasks in this process, until the last or until Ctrl-C.
-
-    Parameters
+    Attributes
     ----------
-    outcomes : generator of (int, result or Failed)
-        Runs the tasks, and yields the number and outcome of each. After an
-        interruption it may yield further finished outcomes.
-    count : int
-        Number of tasks.
-    label : str
-        Label of the progress bar.
-    progress : bool
-        Whether a progress bar is shown on stderr.
+    collect : callable
+        Receives the number and outcome of each value.
+    keep : callable or None
+        Receives them as well, for a checkpoint.
+    numbers : sequence of int or None
+        Numbers of the values by the index in which outcomes arrive; None if they
+        arrive with their numbers.
+    seen : set of int
+        Values that ran or failed.
+    lost : dict of int to Exception
+        Values that no worker finished.
     """
-    account: Account[R] = Account()
-    with _counting_interruptions() as pressed, bar(count, label, progress) as advance:
-        try:
-            for k, outcome in outcomes:
-                account.found[k] = outcome
-                advance()
-        except KeyboardInterrupt:
-            account.interrupted = True
-            account.found |= dict(_ready(outcomes))
-            if len(pressed) > 1:
-                raise
-    return account
+
+    collect: Callable[[int, R | Failed], object]
+    keep: Callable[[int, R | Failed], object] | None = None
+    numbers: Sequence[int] | None = None
+    seen: set[int] = field(default_factory=set)
+    lost: dict[int, Exception] = field(default_factory=dict)
+
+    def add(self, k: int, outcome: R | Failed) -> None:
+        """Record an outcome."""
+        number = k if self.numbers is None else self.numbers[k]
+        self.seen.add(number)
+        if isinstance(outcome, Failed) and outcome.by_executor:
+            self.lost[number] = outcome.error
+        elif self.keep is not None:
+            self.keep(number, outcome)
+        self.collect(number, outcome)
 
 
-def _ready(outcomes: Generator[tuple[int, R], None, None]) -> Iterator[tuple[int, R]]:
-    """Outcomes that a generator yields after an interruption."""
-    try:
-        yield outcomes.throw(KeyboardInterrupt)
-        yield from outcomes
-    except (KeyboardInterrupt, StopIteration):
-        return
-
-
-def executed(
-    run: Callable[[T], R],
-    tasks: Sequence[T],
-    executor: Executor | None,
-    timeout: float | None,
+def _gathered(
+    outcomes: Generator[tuple[int, R | Failed], None, None],
+    account: _Account[R],
+    count: int,
     label: str,
     progress: bool,
-) -> Account[R]:
-    """Outcomes of tasks, taken as they complete, until the last or until Ctrl-C.
-
-    Parameters
-    ----------
-    run : callable
-        Maps a task to its result.
-    tasks : sequence
-        Arguments of `run`.
-    executor : object with ``submit``, or None
-        Where the tasks run; None for this process.
-    timeout : float or None
-        Time limit of a run [s].
-    label : str
-        Label of the progress bar.
-    progress : bool
-        Whether a progress bar is shown on stderr.
-
-    Notes
-    -----
-    Futures are taken as they complete where they have ``add_done_callback`` or
-    ``done``, and in the order of submission where they have ``result`` alone.
-    Tasks that an executor does not finish are not run again. On Ctrl-C, and
-    whenever this function raises, tasks that have not begun are cancelled; the
-    executor finishes the others.
-    """
-    if executor is None:
-        here = ((k, tried(run, task, timeout)) for k, task in enumerate(tasks))
-        return gathered(here, len(tasks), label, progress)
-    account: Account[R] = Account()
-    futures: dict[int, Future[R | Failed]] = {}
-    try:
-        with _counting_interruptions() as pressed, bar(len(tasks), label, progress) as advance:
-            try:
-                rejected = _submit(partial(tried, run, timeout=timeout), tasks, executor, futures)
-                for k, outcome in _completed(futures):
-                    account.found[k] = outcome
-                    advance()
-                account.found |= rejected
-            except KeyboardInterrupt:
-                if len(pressed) > 1:
-                    raise
-                account.interrupted = True
-        if account.interrupted:
-            done = {k: future for k, future in futures.items() if _is_done(future)}
-            _cancel({k: future for k, future in futures.items() if k not in done})
-            account.found |= _results({k: future for k, future in done.items() if k not in account.found})
-    finally:
-        _cancel(futures)
-        futures.clear()  # an executor keeps results that are still referenced
-    return account
-
-
-class Shared(Generic[T]):
-    """Value shared by many tasks, unpickled once per thread.
-
-    Parameters
-    ----------
-    value : object
-        Pickled once if possible; otherwise by the executor for each task.
-    """
-
-    def __init__(self, value: T) -> None:
-        self._value, self._key = value, uuid4().hex
+) -> bool:
+    """Take outcomes until the last or until Ctrl-C; return whether it was Ctrl-C."""
+    with counting_interruptions() as pressed, bar(count, label, progress) as advance:
         try:
-            data = pickle.dumps(value)
-        except Exception:  # of a user's object; the executor may be able to pickle it
-            data = b""
-        # pickle refers to objects of __main__ by name, which another process may not have.
-        self._data = b"" if b"__main__" in data else data
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return _received, (self._key, self._data, None if self._data else self._value)
-
-    def made(self, make: Callable[[T], R]) -> R:
-        """Result of `make` for the value, cached per thread."""
-        return _cache().get(self._key, lambda: make(self._own()))
-
-    def _own(self) -> T:
-        return pickle.loads(self._data) if self._data else self._value  # noqa: S301 (pickled here)
+            for _ in account.seen:
+                advance()
+            for k, outcome in outcomes:
+                account.add(k, outcome)
+                advance()
+        except KeyboardInterrupt as error:
+            for k, outcome in ready(outcomes):
+                account.add(k, outcome)
+            if len(pressed) > 1 or isinstance(error.__context__, KeyboardInterrupt):
+                raise
+            return True
+    return False
 
 
-def _received(key: str, data: bytes, value: T) -> Shared[T]:
-    shared: Shared[T] = object.__new__(Shared)
-    shared._key, shared._data, shared._value = key, data, value
-    return shared
-
-
-_HERE = threading.local()
-
-
-def _cache() -> Lru[str, Any]:
-    """Cache of this thread."""
-    if not hasattr(_HERE, "cache"):
-        _HERE.cache = Lru(_CACHED)
-    cache: Lru[str, Any] = _HERE.cache
-    return cache
-
-
-_PRESSED: ContextVar[Sequence[int]] = ContextVar("pressed", default=())
-"""Signals of Ctrl-C since the runs began."""
-
-
-@contextmanager
-def _counting_interruptions() -> Iterator[Sequence[int]]:
-    """Context that records Ctrl-C, since a KeyboardInterrupt raised in a callback may be swallowed.
-
-    Like `asyncio.run`: in the main thread only, and only with the default handler.
-    """
-    pressed: list[int] = []
-    here = threading.current_thread() is threading.main_thread()
-    if not here or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield pressed
+def _check_count(count: object, name: str) -> None:
+    """Raise if a number of workers or values is given and not an integer above 0."""
+    if count is None:
         return
-
-    def record(number: int, frame: FrameType | None) -> None:
-        pressed.append(number)
-        signal.default_int_handler(number, frame)
-
-    token = _PRESSED.set(pressed)
-    signal.signal(signal.SIGINT, record)
     try:
-        yield pressed
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        _PRESSED.reset(token)
-
-
-def _raise_if_pressed() -> None:
-    if _PRESSED.get():
-        raise KeyboardInterrupt
-
-
-def _submit(
-    run: Callable[[T], R], tasks: Sequence[T], executor: Executor, futures: dict[int, Future[R]]
-) -> dict[int, Failed]:
-    """Submit all tasks; return those that the executor rejects, with the reason."""
-    for k, task in enumerate(tasks):
-        try:
-            futures[k] = executor.submit(run, task)
-        except (Exception, SystemExit) as error:  # of the executor: it is broken, or cannot send the task
-            return dict.fromkeys(range(k, len(tasks)), Failed.of(error, by_executor=True))
-    return {}
-
-
-def _completed(futures: dict[int, Future[R]]) -> Iterator[tuple[int, R | Failed]]:
-    """Outcomes as they complete; each future is then released, so that its result can be freed."""
-    done: SimpleQueue[int] = SimpleQueue()
-    notifies = all(hasattr(future, "add_done_callback") for future in futures.values())
-    if not notifies and not all(hasattr(future, "done") for future in futures.values()):
-        for k in list(futures):
-            yield k, _outcome(futures[k])
-            del futures[k]
-        return
-    for k, future in futures.items():
-        if notifies and hasattr(future, "add_done_callback"):
-            future.add_done_callback(lambda _, k=k: done.put(k))
-    while futures:
-        try:
-            ready = [done.get(timeout=_POLL_WITH_CALLBACKS if notifies else _POLL)]
-        except Empty:
-            ready = [k for k, future in futures.items() if _is_done(future)]
-        _raise_if_pressed()
-        for k in ready:
-            if k in futures:
-                yield k, _outcome(futures[k])
-                del futures[k]
-
-
-def _outcome(future: Future[R]) -> R | Failed:
-    """Result of a future, or the failure of the executor."""
-    try:
-        return future.result()
-    except (Exception, SystemExit, CancelledError) as error:  # a worker died, or the result cannot be read
-        _raise_if_pressed()  # which the workers receive as well
-        return Failed.of(error.with_traceback(None), by_executor=True)  # a traceback would keep the future alive
-
-
-def _results(futures: dict[int, Future[R]]) -> dict[int, R]:
-    """Results of finished futures; exceptions after an interruption are not failures of tasks."""
-    found = {}
-    for k, future in futures.items():
-        with suppress(Exception, CancelledError):
-            if hasattr(future, "exception") and future.exception() is None:
-                found[k] = future.result()
-    return found
-
-
-def _cancel(futures: Mapping[int, Future[object]]) -> None:
-    for future in futures.values():
-        if not _is_done(future) and hasattr(future, "cancel"):
-            with suppress(Exception):  # the other tasks must still be cancelled
-                future.cancel()
-
-
-def _is_done(future: Future[object]) -> bool:
-    return bool(future.done()) if hasattr(future, "done") else False
+        usable = not isinstance(count, bool) and index(count) > 0  # type: ignore[arg-type]
+    except TypeError:
+        usable = False
+    if not usable:
+        raise ValueError(f"{name} must be an integer of at least 1, or None, got {count!r:.80}")

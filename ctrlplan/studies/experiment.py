@@ -9,13 +9,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+import ctrlplan
 from ctrlplan._checks import real_array
 from ctrlplan._display import Displayed, Facts, Part, counted, title_of
 from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event
 from ctrlplan.studies.alike import Linear, numbers_of, outputs_together
+from ctrlplan.studies.checkpoint import digest
 from ctrlplan.studies.measures import (
     Chosen,
     Measure,
@@ -50,11 +52,15 @@ class Measured:
         Runs by plan; empty for loops that were solved together.
     failures : dict of str to str
         Reasons of plans whose run failed; these have no other entries.
+    signals : dict of str to dict of str to ndarray
+        Outputs and controls by plan and label, at the samples that were given to
+        `Experiment.run_alike`.
     """
 
     metrics: Metrics
     runs: dict[str, Run] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
+    signals: dict[str, dict[str, Array]] = field(default_factory=dict)
 
     def whole(self) -> Measured:
         """Return the same results if the runs of all plans succeeded.
@@ -219,6 +225,24 @@ class Experiment(Displayed):
         """Start of the interval of the metrics [s]."""
         return min(plan.start for plan in self.plans.values()) if self.start is None else float(self.start)
 
+    def identity(self) -> dict[str, object]:
+        """Plain data that identify the experiment in a checkpoint."""
+        state, measures = self.initial_state, wanted_measures(self.measures)
+        return {
+            "version of ctrlplan": ctrlplan.__version__,
+            "plans": {name: _plan_token(plan) for name, plan in self.plans.items()},
+            "timepts": digest(self.timepts),
+            "waypoints": [digest([w.time, *w.position]) for w in self.waypoints],
+            "start": self.since,
+            "band": float(self.band),
+            "outputs": list(self.outputs or ()),
+            "controls": None if self.controls is None else list(self.controls),
+            "initial_state": None if state is None else digest(state),
+            "params": {name: _token(value) for name, value in (self.params or {}).items()},
+            "events": None if self.events is None else [event.name for event in self.events],
+            "measures": list(measures),
+        }
+
     def run(self, loop: System | Builder) -> Measured:
         """Simulate a loop with every plan, and compute the metrics.
 
@@ -296,13 +320,17 @@ class Experiment(Displayed):
             return None
         return {name: plan.jet(times[:1], 0, left=True)[0, :, 0] for name, plan in self.plans.items()}
 
-    def run_alike(self, loops: Sequence[System | Linear]) -> list[Measured] | None:
+    def run_alike(
+        self, loops: Sequence[System | Linear], samples: NDArray[np.intp] | None = None
+    ) -> list[Measured] | None:
         """Solve linear loops together with every plan, with the same metrics as `run`.
 
         Parameters
         ----------
         loops : sequence of control systems or Linear
             Loops of the same structure.
+        samples : ndarray of int, shape (nsamples,), optional
+            Samples at which outputs and controls are stored; none by default.
 
         Returns
         -------
@@ -314,17 +342,21 @@ class Experiment(Displayed):
         if not alike or len(alike) < len(numbers) or not all(loop.fits(alike[0]) for loop in alike):
             return None
         tracked, wanted = alike[0].tracked, wanted_measures(self.measures)
-        acting = alike[0].acting if self._listed("control") else ()
+        acting = alike[0].acting if samples is not None or self._listed("control") else ()
         signals, unstable = outputs_together(alike, (*tracked, *acting), self.plans, self.timepts)
         found: list[Metrics] = [{} for _ in alike]
+        stored: list[dict[str, dict[str, Array]]] = [{} for _ in alike]
         for name, plan in self.plans.items():
-            y, u = np.split(signals.pop(name), [len(tracked)], axis=1)
+            rows = signals.pop(name)
+            for i, curves in enumerate(stored) if samples is not None else ():
+                curves[name] = dict(zip((*tracked, *acting), rows[i][:, samples], strict=True))
+            y, u = np.split(rows, [len(tracked)], axis=1)
             record = SignalRecord(self.timepts, y, u, self.axes, acting, unstable)
             values = signal_metrics(record, plan, self.since, self.band, wanted)
             of_path = path_metrics(plan, self.waypoints, wanted)
             for i, metrics in enumerate(found):
                 metrics[name] = {key: float(row[i]) for key, row in values.items()} | of_path
-        return [Measured(metrics) for metrics in found]
+        return [Measured(metrics, signals=curves) for metrics, curves in zip(found, stored, strict=True)]
 
     def _metrics(self, run: Run) -> dict[str, float]:
         """Metrics of a run, up to its end."""
@@ -419,6 +451,20 @@ def _check_band(band: float) -> None:
     """Raise if a settling band is not a finite number above 0."""
     if not 0.0 < _number(band, "band") < math.inf:
         raise ValueError(f"band must be a finite number above 0, relative to the range of the plan, got {band!r}")
+
+
+def _plan_token(plan: Trajectory) -> str:
+    """Labels of a plan, and a hash of its motion and its ends."""
+    t = np.linspace(plan.start, plan.end, 101)
+    return f"{', '.join(plan.labels)}: {digest([plan.start, plan.end, *plan.initial, *plan.jet(t, 2).ravel()])}"
+
+
+def _token(value: object) -> str:
+    """Value of a parameter if it is a number or an array of numbers, otherwise its type."""
+    try:
+        return digest(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return type(value).__name__
 
 
 def _number(value: ArrayLike, name: str) -> float:

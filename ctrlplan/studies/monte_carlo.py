@@ -3,37 +3,36 @@
 from __future__ import annotations
 
 import inspect
+import os
+import threading
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol, TypeAlias, TypeGuard
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._lru import Lru
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event, Prepared, SolverError, prepare
 from ctrlplan.simulation.built_forms import NotCompiledError
 from ctrlplan.simulation.methods.delegated import DELEGATED
+from ctrlplan.studies.alike import Linear
+from ctrlplan.studies.batches import FIRST, FIRST_OF_TASK, Batches
+from ctrlplan.studies.checkpoint import digest
 from ctrlplan.studies.comparison import Comparison, comparison_of
 from ctrlplan.studies.draw_results import DrawResults, Outcome, band_samples
 from ctrlplan.studies.ensemble import Ensemble
-from ctrlplan.studies.executing import (
-    Account,
-    Executor,
-    Failed,
-    Shared,
-    checked_executor,
-    checked_timeout,
-    executed,
-    tried,
-)
+from ctrlplan.studies.executing import Execution, executed
+from ctrlplan.studies.executors import Executor
 from ctrlplan.studies.experiment import Experiment
 from ctrlplan.studies.measures import Measure, shown_measures
+from ctrlplan.studies.outcomes import Failed, OneByOne, Runs, tried
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
 
@@ -43,10 +42,14 @@ Forms: TypeAlias = Mapping[str, System]
 Draw: TypeAlias = dict[str, float]
 """Parameters of one draw by name."""
 
-_Task: TypeAlias = tuple[Callable[[Draw], Outcome], "Forms | None"]
+Samples: TypeAlias = NDArray[np.intp]
+"""Indices of the samples of the bands."""
 
 _STAND_INS = 20
 """Number of draws tried in place of a nominal loop that does not run."""
+
+_THREADS = 32
+"""Number of threads for which the loops of a function are prepared separately."""
 
 
 def monte_carlo(
@@ -66,13 +69,16 @@ def monte_carlo(
     measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
     units: Mapping[str, str] | None = None,
     executor: Executor | None = None,
+    workers: int | None = None,
+    chunk: int | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
     progress: bool = True,
     timeout: float | None = None,
 ) -> Ensemble:
     """Compare plans in a loop for many draws of its parameters.
 
-    Failures and interruptions are treated as in `sweep`: failed draws are
-    recorded in `Ensemble.failures`.
+    Failures, interruptions and executors are treated as in `sweep`: failed draws
+    are recorded in `Ensemble.failures`.
 
     Parameters
     ----------
@@ -80,7 +86,8 @@ def monte_carlo(
         A loop with the drawn parameters in the ``params`` of its blocks; it is
         prepared once for all draws. Or a function whose arguments have the
         names of the draws: it is called with a value of each by keyword and
-        returns a loop. Any other callable maps the name of a plan and the plan
+        returns a loop; linear loops of the same structure are solved together in
+        closed form. Any other callable maps the name of a plan and the plan
         to a loop, as in `compare`, with the parameters in its blocks.
     draws : mapping of str to array_like, shape (ndraws,)
         Values of each parameter, as the function `draws` makes them.
@@ -88,22 +95,28 @@ def monte_carlo(
         As for `compare`.
     waypoints, start, band, outputs, controls, initial_state, params, events, measures : optional
         As in `Experiment`; a drawn parameter overrides that of `params`.
-    units, executor, progress, timeout : optional
+    units, executor, workers, chunk, checkpoint, progress, timeout : optional
         As for `sweep`. Other processes require a loop that can be compiled, or a
-        function that the executor can pickle.
+        function that the executor can pickle. A checkpoint of a loop with other
+        nominal metrics is rejected.
 
     Returns
     -------
     Ensemble
+        The bands have at most 1001 times, fewer for very many draws or signals.
 
     Raises
     ------
     TypeError
         If `executor` has no ``submit``.
+    RuntimeError
+        If a worker has other versions of ctrlplan or casadi.
     ValueError
-        If the numbers of draws differ, a draw is not finite, or no block reads
-        a parameter. An exception of the nominal loop is raised if an argument
-        causes it, or if no draw runs.
+        If the numbers of draws differ, a draw is not finite, no block reads a
+        parameter, a function returns loops with different outputs, the loop
+        cannot be sent to other processes, or the checkpoint is that of another
+        study. An exception of the nominal loop is raised if an argument causes
+        it, or if no draw runs.
 
     Warns
     -----
@@ -121,34 +134,45 @@ def monte_carlo(
     >>> bool((found.metrics["step"]["overshoot_error"] > 80.0).all())
     True
     """
-    executor, timeout = checked_executor(executor), checked_timeout(timeout)
+    execution = Execution.from_arguments(locals())
     table = _checked_draws(draws)
     experiment = Experiment.from_arguments(locals())
     drawn_loop: _Drawn = _Built(loop) if _is_of_draws(loop, table) else _Prepared.of(loop, experiment, table)
     nominal, nominal_draw = _nominal(drawn_loop, experiment, table, units, timeout)
     drawn = [_draw(table, k) for k in range(_count(table))]
-    task, again = drawn_loop.task(experiment, drawn, executor is not None, timeout)
-    account = executed(task, drawn, executor, timeout, "draws", progress)
-    account.raise_if_none_ran("the loop")
-    if again is not None:
-        account = _by_python(account, again, experiment, drawn, timeout, progress)
+    curves = len(experiment.plans) * len({*nominal.outputs, *nominal.controls})
+    samples = band_samples(experiment.timepts, len(drawn), curves)
+    runs, again = drawn_loop.runs(experiment, samples, drawn, executor is not None, timeout)
     shown = shown_measures(experiment.measures, list(nominal.metrics.values()))
-    results = DrawResults(_count(table), experiment.timepts, shown.keys() - nominal.measures.keys())
-    for k, outcome in account.in_order().items():
-        results.add(k, drawn[k], outcome)
-    if account.interrupted:
+    results = DrawResults(len(drawn), experiment.timepts[samples], shown.keys() - nominal.measures.keys())
+    collected = _Collected(drawn, results, again is not None)
+
+    def identity() -> dict[str, object]:
+        tables = {name: digest(values) for name, values in table.items()}
+        own = {"kind": "monte_carlo", "draws": tables, "loop": nominal.metrics, "units": dict(units or {})}
+        return own | experiment.identity()
+
+    done = executed(runs, drawn, collected.add, execution, "draws", identity)
+    done.raise_if_none_ran("the loop")
+    interrupted = done.interrupted
+    if again is not None and collected.aside and not interrupted:
+        here = replace(execution, executor=None, workers=None, checkpoint=None)
+        interrupted = collected.run_again(partial(_outcome, again, experiment, samples), here)
+    if interrupted:
         text = f"monte_carlo was interrupted: {results.finished} of {_count(table)} draws are returned"
         warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())
     return Ensemble(
         nominal,
         table,
-        results.metrics,
+        results.metrics(experiment.plans),
         results.timepts,
-        results.bands(),
-        failures=tuple(results.failures),
+        results.bands(experiment.plans),
+        failures=results.failures(),
         finished=results.finished,
         nominal_draw=nominal_draw,
-        interrupted=account.interrupted,
+        interrupted=interrupted,
+        sent_again=done.sent_again,
+        missing=tuple(sorted({*done.missing, *collected.aside})),
     )
 
 
@@ -200,13 +224,17 @@ def _binds(signature: inspect.Signature, *arguments: object, **named: object) ->
 
 
 def _outcome(
-    forms: Callable[[str], System | Builder], experiment: Experiment, plans: Iterable[str], params: Params | None
+    forms: Mapping[str, System | Builder],
+    experiment: Experiment,
+    samples: Samples,
+    plans: Iterable[str],
+    params: Params | None,
 ) -> Outcome:
     """Outcome of one draw, by plan."""
-    wanted = experiment.timepts[band_samples(experiment.timepts)]
+    wanted = experiment.timepts[samples]
 
     def measured(plan: str) -> tuple[dict[str, float], dict[str, Array]]:
-        form = forms(plan)
+        form = forms[plan]
         with DELEGATED if isinstance(form, Prepared) and form.network is None else nullcontext():
             run, metrics = experiment.run_plan(form, plan, params)
         stored = np.isin(run.t, wanted)
@@ -214,6 +242,49 @@ def _outcome(
         return metrics, {name: run.signals[name][stored] for name in names}
 
     return {plan: tried(measured, plan) for plan in plans}
+
+
+@dataclass(frozen=True)
+class _Collected:
+    """Outcomes of draws as they arrive.
+
+    Attributes
+    ----------
+    drawn : list of dict
+        The draws.
+    results : DrawResults
+        Results of all draws.
+    compiled : bool
+        Whether draws whose solver failed are to be run again by another method.
+    aside : dict of int to Outcome
+        Outcomes of these draws.
+    """
+
+    drawn: list[Draw]
+    results: DrawResults
+    compiled: bool
+    aside: dict[int, Outcome] = field(default_factory=dict)
+
+    def add(self, k: int, outcome: Outcome | Failed) -> None:
+        """Add the outcome of a draw."""
+        if self.compiled and not isinstance(outcome, Failed) and any(map(_of_solver, outcome.values())):
+            self.aside[k] = outcome
+        else:
+            self.results.add(k, self.drawn[k], outcome)
+
+    def run_again(self, run: Callable[[Iterable[str], Draw], Outcome], execution: Execution) -> bool:
+        """Run plans for which CVODES failed in this process, if necessary in Python; return whether interrupted."""
+        numbers = sorted(self.aside)
+
+        def again(k: int) -> Outcome:
+            return run([plan for plan, one in self.aside[k].items() if _of_solver(one)], self.drawn[k])
+
+        def collect(i: int, outcome: Outcome | Failed) -> None:
+            known = self.aside.pop(numbers[i])
+            whole = outcome if isinstance(outcome, Failed) else known | outcome
+            self.results.add(numbers[i], self.drawn[numbers[i]], whole)
+
+        return executed(OneByOne(again), numbers, collect, execution, "draws by Python").interrupted
 
 
 class _Drawn(Protocol):
@@ -226,8 +297,10 @@ class _Drawn(Protocol):
     def nominal(self, params: Draw | None) -> tuple[System | Builder, Draw | None]:
         """Loop for its nominal parameters or those of a draw, and parameters of its blocks."""
 
-    def task(self, experiment: Experiment, drawn: list[Draw], elsewhere: bool, timeout: float | None) -> _Task:
-        """Function of a draw, for this process or for others; and forms that run it again if the solver fails."""
+    def runs(
+        self, experiment: Experiment, samples: Samples, drawn: list[Draw], elsewhere: bool, timeout: float | None
+    ) -> tuple[Runs[Draw, Outcome], Forms | None]:
+        """Runs of the draws, for this process or for others; and forms that run them again if the solver fails."""
 
 
 @dataclass(frozen=True)
@@ -243,13 +316,26 @@ class _Built:
     def nominal(self, params: Draw | None) -> tuple[System | Builder, Draw | None]:
         return self.build(**(params or {})), None
 
-    def task(self, experiment: Experiment, drawn: list[Draw], elsewhere: bool, timeout: float | None) -> _Task:
-        return partial(_of_build, self.build, experiment), None
+    def runs(
+        self, experiment: Experiment, samples: Samples, drawn: list[Draw], elsewhere: bool, timeout: float | None
+    ) -> tuple[Runs[Draw, Outcome], Forms | None]:
+        build, alone = partial(_with_draw, self.build), partial(_of_loop, experiment, samples)
+        first = FIRST_OF_TASK if elsewhere else FIRST
+        return Batches(experiment, build, alone, partial(_alike, experiment, samples), first), None
 
 
-def _of_build(build: Callable[..., System], experiment: Experiment, params: Draw) -> Outcome:
-    loop = build(**params)
-    return _outcome(lambda name: loop, experiment, experiment.plans, None)
+def _with_draw(build: Callable[..., System], params: Draw) -> System:
+    return build(**params)
+
+
+def _of_loop(experiment: Experiment, samples: Samples, loop: System | Builder) -> Outcome:
+    return _outcome(dict.fromkeys(experiment.plans, loop), experiment, samples, experiment.plans, None)
+
+
+def _alike(experiment: Experiment, samples: Samples, loops: Sequence[Linear]) -> list[Outcome]:
+    """Outcomes of linear loops of the same structure."""
+    found = experiment.run_alike(loops, samples) or ()
+    return [{plan: (metrics, one.signals[plan]) for plan, metrics in one.metrics.items()} for one in found]
 
 
 @dataclass(frozen=True)
@@ -284,32 +370,45 @@ class _Prepared:
     def nominal(self, params: Draw | None) -> tuple[System | Builder, Draw | None]:
         return (lambda name, plan: self.forms[name]), params
 
-    def task(self, experiment: Experiment, drawn: list[Draw], elsewhere: bool, timeout: float | None) -> _Task:
+    def runs(
+        self, experiment: Experiment, samples: Samples, drawn: list[Draw], elsewhere: bool, timeout: float | None
+    ) -> tuple[Runs[Draw, Outcome], Forms | None]:
         # Compiled and compared with Python in this process, for the first draw and a random one.
-        here = partial(_of_forms, self.forms, experiment)
+        here = partial(_of_forms, self.forms, experiment, samples)
         for k in sorted({0, int(np.random.default_rng(0).integers(len(drawn)))}):
             tried(here, drawn[k], timeout)
         light = _light(self.forms, drawn[0])
         again = None if light is None else self.forms
         if not elsewhere:
-            return partial(_of_forms, light or self.forms, experiment), again
-        sent: Forms | Builder = light or (self.loop if is_builder(self.loop) else self.forms)
-        return partial(_elsewhere, Shared(sent), experiment), again
+            return OneByOne(partial(_of_forms, light or self.forms, experiment, samples)), again
+        sent = _Sent(light or (self.loop if is_builder(self.loop) else self.forms))
+        return OneByOne(partial(_elsewhere, sent, experiment, samples)), again
 
 
-def _of_forms(forms: Forms, experiment: Experiment, params: Draw) -> Outcome:
-    return _outcome(lambda name: forms[name], experiment, experiment.plans, params)
+def _of_forms(forms: Forms, experiment: Experiment, samples: Samples, params: Draw) -> Outcome:
+    return _outcome(forms, experiment, samples, experiment.plans, params)
 
 
-def _elsewhere(shared: Shared[Forms | Builder], experiment: Experiment, params: Draw) -> Outcome:
+@dataclass(frozen=True)
+class _Sent:
+    """Loops for other processes and threads: prepared forms, or a function that builds them."""
+
+    given: Forms | Builder
+    made: Lru[int, Forms] = field(default_factory=lambda: Lru(_THREADS))
+
+    def forms(self, plans: Mapping[str, Trajectory]) -> Forms:
+        """Forms for this thread."""
+        if isinstance(self.given, Mapping):
+            return self.given
+        build = self.given
+        return self.made.get(
+            threading.get_ident(), lambda: {name: prepare(build(name, plan)) for name, plan in plans.items()}
+        )
+
+
+def _elsewhere(sent: _Sent, experiment: Experiment, samples: Samples, params: Draw) -> Outcome:
     """Outcome of one draw in another process or thread."""
-
-    def forms(given: Forms | Builder) -> Forms:
-        if isinstance(given, Mapping):
-            return given
-        return {name: prepare(given(name, plan)) for name, plan in experiment.plans.items()}
-
-    return _of_forms(shared.made(forms), experiment, params)
+    return _of_forms(sent.forms(experiment.plans), experiment, samples, params)
 
 
 def _nominal(
@@ -348,37 +447,6 @@ def _nominal(
     assert own is not None  # noqa: S101 (there is a draw, and it failed)
     own.error.add_note("with the nominal parameters of the loop, and with the first draws")
     raise own.error
-
-
-def _by_python(
-    account: Account[Outcome],
-    forms: Forms,
-    experiment: Experiment,
-    drawn: list[Draw],
-    timeout: float | None,
-    progress: bool,
-) -> Account[Outcome]:
-    """Outcomes, with plans and draws for which CVODES failed run again in this process, if necessary in Python."""
-    failed = {
-        k: [plan for plan, one in outcome.items() if _of_solver(one)]
-        for k, outcome in account.in_order().items()
-        if not isinstance(outcome, Failed) and any(map(_of_solver, outcome.values()))
-    }
-    if not failed:
-        return account
-    found = {k: outcome for k, outcome in account.found.items() if k not in failed}
-    if account.interrupted:
-        return Account(found, True)
-
-    def run(k: int) -> Outcome:
-        return _outcome(lambda name: forms[name], experiment, failed[k], drawn[k])
-
-    again = executed(run, list(failed), None, timeout, "draws by Python", progress)
-    for i, outcome in again.found.items():
-        k = list(failed)[i]
-        known = account.found[k]
-        found[k] = known | outcome if isinstance(known, dict) and isinstance(outcome, dict) else outcome
-    return Account(found, again.interrupted)
 
 
 def _check_read(forms: Mapping[str, Prepared], table: dict[str, Array], start: ArrayLike | None) -> None:

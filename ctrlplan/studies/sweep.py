@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -19,20 +19,15 @@ from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Params
 from ctrlplan.simulation import Event
 from ctrlplan.studies.alike import Linear
+from ctrlplan.studies.batches import FIRST, FIRST_OF_TASK, Batches
+from ctrlplan.studies.checkpoint import digest
 from ctrlplan.studies.comparison import finite_or_none, shown_in_units
-from ctrlplan.studies.ensemble import Failure
-from ctrlplan.studies.executing import (
-    Account,
-    Executor,
-    Failed,
-    checked_executor,
-    checked_timeout,
-    executed,
-    gathered,
-    tried,
-)
+from ctrlplan.studies.ensemble import Failure, numbers_shown
+from ctrlplan.studies.executing import Executed, Execution, executed
+from ctrlplan.studies.executors import Executor
 from ctrlplan.studies.experiment import Experiment, Metrics
 from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, shown_measures, wanted_measures
+from ctrlplan.studies.outcomes import Failed
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import CONTROL, Builder, System, is_builder
 from ctrlplan.studies.units import (
@@ -69,7 +64,7 @@ class Sweep(Displayed):
     failures : tuple of Failure
         Failed values, with the reason; `Failure.draw` is the index of the value.
     interrupted : bool
-        Whether Ctrl-C ended the sweep; values that did not run are missing.
+        Whether Ctrl-C ended the sweep; values that did not run are not in `values`.
     roles : dict of str to Role
         Role of each plan, if known.
     band : float
@@ -80,6 +75,11 @@ class Sweep(Displayed):
         Labels of the axes of the plans, and of the controls.
     measures : dict of str to Measure
         Titles and units of the metrics.
+    sent_again : tuple of float
+        Values that were sent to an executor again because their worker ended.
+    missing : tuple of float
+        Values that no worker finished, which are in `failures` too, or that did
+        not run before an interruption.
     """
 
     parameter: str
@@ -93,6 +93,8 @@ class Sweep(Displayed):
     axes: tuple[str, ...] = ()
     controls: tuple[str, ...] = ()
     measures: dict[str, Measure] = field(default_factory=lambda: dict(MEASURES))
+    sent_again: tuple[float, ...] = ()
+    missing: tuple[float, ...] = ()
 
     def title_of(self, name: str) -> str:
         """Title of a metric."""
@@ -114,6 +116,8 @@ class Sweep(Displayed):
                 (self.parameter, ends),
                 ("failures", str(len(self.failures)) if self.failures else ""),
                 ("interrupted", "yes: some values were not run" if self.interrupted else ""),
+                ("sent again", numbers_shown(self.sent_again)),
+                ("missing", numbers_shown(self.missing)),
             ]
         )
         yield self.metric_table()
@@ -175,7 +179,11 @@ class Sweep(Displayed):
         moved = [replace(failure, draw=int(place[failure.draw])) for failure in self.failures]
         moved += [replace(failure, draw=int(place[failure.draw + self.values.size])) for failure in other.failures]
         failures = tuple(sorted(moved, key=lambda failure: failure.draw))
+        failed = values[order][[failure.draw for failure in failures]]
         interrupted = self.interrupted or other.interrupted
+        again, missing = (
+            tuple(sorted({*getattr(self, name), *getattr(other, name)})) for name in ("sent_again", "missing")
+        )
         return replace(
             self,
             values=values[order],
@@ -183,6 +191,8 @@ class Sweep(Displayed):
             failures=failures,
             interrupted=interrupted,
             roles=self.roles | other.roles,
+            sent_again=again,
+            missing=tuple(value for value in missing if value not in values or value in failed),
         )
 
     def column(self, plan: str, name: str) -> Array:
@@ -259,17 +269,20 @@ def sweep(
     measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
     units: Mapping[str, str] | None = None,
     executor: Executor | None = None,
+    workers: int | None = None,
+    chunk: int | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
     progress: bool = True,
     timeout: float | None = None,
 ) -> Sweep:
     """Compare plans in a loop for each value of a parameter.
 
     A value is recorded in `Sweep.failures` with the reason if its run raises an
-    exception, calls ``sys.exit`` or exceeds the time limit, or if its worker
-    process dies; the sweep continues. Ctrl-C ends the sweep: finished results are
-    returned with a warning, and tasks that have not begun are cancelled; an
-    executor finishes those that have. A second Ctrl-C, or one before the first
-    result of `monte_carlo`, raises KeyboardInterrupt.
+    exception, calls ``sys.exit`` or exceeds the time limit; the sweep continues.
+    Ctrl-C ends the sweep: finished results are returned with a warning, and tasks
+    that have not begun are cancelled; an executor finishes those that have. A
+    second Ctrl-C, or one before the first result of `monte_carlo`, raises
+    KeyboardInterrupt.
 
     Parameters
     ----------
@@ -290,8 +303,20 @@ def sweep(
         Where the comparisons run: an object with ``submit`` whose result has
         ``result``, as of `dask.distributed`, `loky` or `mpi4py.futures`; not a
         `multiprocessing.Pool`. Other processes require a `build` that the
-        executor can pickle. Without an executor, linear loops of the same
-        structure are solved and measured together, which is much faster.
+        executor can pickle. Linear loops of the same structure are solved and
+        measured together, which is much faster than one by one.
+    workers : int, optional
+        Number of workers of the executor, if it does not state one: at most twice
+        as many tasks are in flight. If the number is not known, all tasks are
+        submitted at the beginning.
+    chunk : int, optional
+        Number of values of a task; by default at most 250, fewer if a worker
+        would have less than four tasks. A task returns after a second what it has
+        not run, unless `build` or a run does not return.
+    checkpoint : path, optional
+        Folder of finished values, which is made if needed. A second call with the
+        same values and options runs only what is missing. Failures are run again.
+        `build` is not compared: use a new folder after a change of the loop.
     progress : bool, optional
         Whether a progress bar is shown on stderr.
     timeout : float, optional
@@ -309,8 +334,11 @@ def sweep(
     TypeError
         If `executor` has no ``submit``, or `build` is not a function.
     ValueError
-        If the values are not finite or do not increase. If all values fail, the
-        first exception is raised, SystemExit as a RuntimeError.
+        If the values are not finite or do not increase, `build` cannot be sent to
+        other processes, or the checkpoint is that of another study. If all values
+        fail, the first exception is raised, SystemExit as a RuntimeError.
+    RuntimeError
+        If a worker has other versions of ctrlplan or casadi.
 
     Warns
     -----
@@ -321,6 +349,35 @@ def sweep(
     --------
     monte_carlo : Random draws of several parameters.
 
+    Notes
+    -----
+    The loop is sent to each worker once, a task has its values only. Values of a
+    task whose worker ends are sent again, twice at most, one at a time, so that
+    only the value that ends its worker has no result: see `Sweep.sent_again` and
+    `Sweep.missing`. A broken `concurrent.futures.ProcessPoolExecutor` is replaced
+    by one of the same size and start method. Nothing runs in this process
+    instead. Results differ from those without an executor by rounding errors,
+    1e-14 of the largest value.
+
+    On a dask cluster, with `build` and `values` in a module ``study``::
+
+        from dask.distributed import Client
+        import ctrlplan as cp, study
+        if __name__ == "__main__":
+            with Client("tcp://scheduler:8786") as client:
+                cp.sweep(study.build, study.values, study.plans, study.timepts, executor=client)
+
+    With MPI, the script takes ``executor=mpi4py.futures.MPIPoolExecutor()`` and is
+    started with one process for itself and one for each worker::
+
+        mpiexec -n 65 python -m mpi4py.futures study.py
+
+    With ray, the executor is an object of the class::
+
+        class Ray:
+            def submit(self, function, task):
+                return ray.remote(function).remote(task).future()
+
     Examples
     --------
     >>> import numpy as np
@@ -330,19 +387,22 @@ def sweep(
     >>> found.metrics["step"]["overshoot_error"].round(1)
     array([16.3, 85.4])
     """
-    executor, timeout = checked_executor(executor), checked_timeout(timeout)
+    execution = Execution.from_arguments(locals())
     points = _checked_values(values)
     if not is_builder(build):
         raise TypeError(f"build must be a function of a value that returns a loop, got {type(build).__name__}")
     experiment = Experiment.from_arguments(locals())
-    if executor is None:
-        outcomes = _outcomes(build, points.tolist(), experiment, units, timeout)
-        account = gathered(outcomes, points.size, parameter, progress)
-    else:
-        run = partial(_built, build, experiment, units)
-        account = executed(run, points.tolist(), executor, timeout, parameter, progress)
-        account.raise_if_none_ran("build")
-    found = _swept(parameter, points, account)
+    outcomes: dict[int, Metrics | Failed] = {}
+    alike = None if units is not None else partial(_metrics_alike, experiment)
+    first = FIRST if executor is None else FIRST_OF_TASK
+    runs = Batches(experiment, build, partial(_metrics, experiment, units), alike, first)
+
+    def identity() -> dict[str, object]:
+        return {"kind": "sweep", "values": digest(points), "units": dict(units or {}), **experiment.identity()}
+
+    done = executed(runs, points.tolist(), outcomes.__setitem__, execution, parameter, identity)
+    done.raise_if_none_ran("build")
+    found = _swept(parameter, points, outcomes, done)
     found = _described(found, experiment, dict(units or {}))
     if found.interrupted:
         text = f"the sweep was interrupted: {found.values.size} of {points.size} values are returned"
@@ -357,10 +417,10 @@ def _checked_values(values: ArrayLike) -> Array:
     return points
 
 
-def _swept(parameter: str, points: Array, account: Account[Metrics]) -> Sweep:
-    found = account.in_order()
+def _swept(parameter: str, points: Array, outcomes: Mapping[int, Metrics | Failed], done: Executed) -> Sweep:
+    found = dict(sorted(outcomes.items()))
     errors = [(i, outcome) for i, outcome in enumerate(found.values()) if isinstance(outcome, Failed)]
-    if errors and len(errors) == len(found) and not account.interrupted:
+    if errors and len(errors) == len(found) and not done.interrupted:
         raise errors[0][1].error
     reached = points[list(found)]
     rows: dict[str, dict[str, Array]] = {}
@@ -370,7 +430,8 @@ def _swept(parameter: str, points: Array, account: Account[Metrics]) -> Sweep:
             for name, value in values.items():
                 row.setdefault(name, np.full(reached.size, np.nan))[i] = value
     failures = tuple(Failure(i, {parameter: float(reached[i])}, failed.message) for i, failed in errors)
-    return Sweep(parameter, reached, rows, failures, account.interrupted)
+    again, missing = (tuple(points[list(numbers)].tolist()) for numbers in (done.sent_again, done.missing))
+    return Sweep(parameter, reached, rows, failures, done.interrupted, sent_again=again, missing=missing)
 
 
 def _described(found: Sweep, experiment: Experiment, units: dict[str, str]) -> Sweep:
@@ -407,68 +468,9 @@ def _metrics(experiment: Experiment, units: Mapping[str, str] | None, loop: Syst
     return found.metrics
 
 
-def _built(
-    build: Callable[[float], System | Builder],
-    experiment: Experiment,
-    units: Mapping[str, str] | None,
-    value: float,
-) -> Metrics:
-    """Metrics for one value."""
-    return _metrics(experiment, units, build(value))
-
-
-_SAMPLES = 2**19
-"""Maximum number of samples of a signal over all loops that are solved together."""
-
-_FIRST = 4
-"""Number of loops solved together at first; doubled each time, so that an interruption discards few results."""
-
-
-def _outcomes(
-    build: Callable[[float], System | Builder],
-    values: list[float],
-    experiment: Experiment,
-    units: Mapping[str, str] | None,
-    timeout: float | None,
-) -> Generator[tuple[int, Metrics | Failed], None, None]:
-    """Outcome of each value; linear loops of the same structure are solved together.
-
-    The first of these is run separately, which checks the arguments for the loop.
-    """
-    waiting: dict[int, Linear] = {}
-    checked, size = False, _FIRST
-    largest = max(2, _SAMPLES // max(1, experiment.timepts.size))
-
-    def together() -> Iterator[tuple[int, Metrics | Failed]]:
-        nonlocal size
-        try:
-            found = (experiment.run_alike(list(waiting.values())) or []) if waiting else []
-            yield from ((k, one.metrics) for k, one in zip(waiting, found, strict=True))
-        except Exception:  # of one of them: run each separately
-            for k in waiting:
-                yield k, tried(partial(_built, build, experiment, units), values[k], timeout)
-        waiting.clear()
-        size = min(2 * size, largest)
-
-    try:
-        for k, value in enumerate(values):
-            loop = tried(build, value, timeout)
-            linear = None if isinstance(loop, Failed) or units is not None else experiment.numbers_of(loop)
-            if linear is None or not checked:
-                run = partial(_metrics, experiment, units)
-                outcome = loop if isinstance(loop, Failed) else tried(run, loop, timeout)
-                checked = checked or (linear is not None and not isinstance(outcome, Failed))
-                yield k, outcome
-                continue
-            if waiting and not linear.fits(next(iter(waiting.values()))):
-                yield from together()
-            waiting[k] = linear
-            if len(waiting) >= size:
-                yield from together()
-        yield from together()
-    except KeyboardInterrupt:  # results of the loops already built
-        yield from together()
-        raise
+def _metrics_alike(experiment: Experiment, loops: Sequence[Linear]) -> list[Metrics]:
+    """Metrics of linear loops of the same structure."""
+    return [one.metrics for one in experiment.run_alike(loops) or ()]
 
 
 def settling_jumps(values: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_]:

@@ -221,7 +221,7 @@ def test_a_loop_that_only_python_runs_can_not_be_sent():
 
 def test_a_function_that_cannot_be_pickled_can_not_be_sent():
     with pytest.raises(
-        ValueError, match=r"the loop must be picklable for other processes, got .* give a function that builds it"
+        ValueError, match=r"the loop must be picklable for other processes, got .* move the builder into a module"
     ):
         run(lambda name, plan: lag_by_python(), {"tau": [0.5, 1.0]}, Elsewhere())
 
@@ -230,7 +230,7 @@ def test_a_loop_is_not_taken_for_a_function_that_builds_it():
     loop = ct.nlsys(_lag_rate, _lag_out, states=1, inputs="r", outputs="y", params={"tau": 1.0}, name="lag")
     pickle.dumps(loop)
     with pytest.raises(
-        ValueError, match=r"the loop must be picklable for other processes, got .* give a function that builds it"
+        ValueError, match=r"the loop must be picklable for other processes, got .* move the builder into a module"
     ):
         run(loop, {"tau": [0.5, 1.0]}, Elsewhere())
 

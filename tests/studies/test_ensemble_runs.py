@@ -45,6 +45,12 @@ def test_a_dask_cluster_finds_the_same_bits(found):
     ):
         same_bits(found, run(lag(), LAGS, client.get_executor()))
         same_bits(found, run(lag(), LAGS, client))
+        gains = np.geomspace(0.5, 50.0, 60)
+        alone = cp.sweep(cp.plants.integrator_lag_loop, gains, PLANS, TIMES, progress=False)
+        shared = cp.sweep(cp.plants.integrator_lag_loop, gains, PLANS, TIMES, executor=client, progress=False)
+        for plan, rows in alone.metrics.items():
+            for name, row in rows.items():
+                np.testing.assert_allclose(shared.metrics[plan][name], row, rtol=1e-14, atol=1e-14 * 100.0)
         ran = client.run(lambda: "ctrlplan" in __import__("sys").modules)
         assert list(ran.values()) == [True, True]  # both had some of it
 

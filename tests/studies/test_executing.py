@@ -13,7 +13,7 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan.simulation import budget
-from ctrlplan.studies.executing import Failed
+from ctrlplan.studies.outcomes import Failed
 
 TIMES = np.linspace(0.0, 10.0, 201)
 PLANS = {"step": cp.Step(1.0)}
@@ -185,7 +185,7 @@ def drawn_by_python():
 
 def test_what_cannot_be_sent_is_said_in_the_executors_words():
     with pytest.raises(
-        ValueError, match=r"build must be picklable for other processes, got .*lambda.*; give a function that"
+        ValueError, match=r"build must be picklable for other processes, got .*lambda.*; move the builder into a"
     ):
         swept(lambda rate: lag(rate), executor=Pickling())
     with pytest.raises(
@@ -229,21 +229,67 @@ class Losing(InTurn):
         return super().run(k)
 
 
-@pytest.mark.parametrize("error", [RuntimeError("worker died"), CancelledError(), SystemExit(3)])
-def test_what_a_worker_takes_with_it_is_named_and_runs_nowhere_else(error):
+ERRORS = [RuntimeError("worker died"), CancelledError(), SystemExit(3)]
+
+
+def stated(error):
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
+
+
+@pytest.mark.parametrize("error", ERRORS)
+def test_a_lost_task_is_sent_again_and_the_result_lists_it(error):
     built = []
     found = swept(lambda rate: built.append(rate) or lag(rate), executor=Losing({1, 4}, error))
-    assert built == [0.5, 1.5, 2.0, 3.0]
-    name = f"{type(error).__name__}: {error}".removesuffix(": ")
+    assert built == [0.5, 1.5, 2.0, 3.0, 1.0, 2.5]
+    check(found, RATES)
+    assert (found.failures, found.sent_again, found.missing) == ((), (1.0, 2.5), ())
+    assert "sent again" in str(found)
+
+
+class Killing(InTurn):
+    """A task that contains one of some values ends its worker, and then runs no value."""
+
+    def __init__(self, killers, error, workers=None):
+        super().__init__()
+        self.killers, self.error, self.sizes, self.flight = set(killers), error, [], []
+        if workers:
+            self.num_workers = workers
+
+    def submit(self, function, task):
+        self.sizes.append(task._values)
+        return super().submit(function, task)
+
+    def run(self, k):
+        self.flight.append(len(self.tasks) - k)
+        if self.killers & {getattr(value, "get", lambda _, v=value: v)("tau") for value in self.sizes[k]}:
+            raise self.error
+        return super().run(k)
+
+
+@pytest.mark.parametrize("error", ERRORS)
+@pytest.mark.parametrize("workers", [None, 2])
+def test_only_the_value_that_ends_its_worker_is_missing(error, workers):
+    values = np.linspace(0.5, 3.0, 23).tolist()
+    built, executor = [], Killing({values[4], values[17]}, error, workers)
+    found = swept(lambda rate: built.append(rate) or lag(rate), values, executor, chunk=5)
+    missing = [values[4], values[17]]
     assert [(f.draw, f.params, f.message) for f in found.failures] == [
-        (1, {"value": 1.0}, name),
-        (4, {"value": 2.5}, name),
+        (k, {"value": values[k]}, stated(error)) for k in (4, 17)
     ]
-    assert np.isnan(found.metrics["step"]["settling_time"]).tolist() == [k in (1, 4) for k in range(6)]
-    assert not found.interrupted
+    assert np.flatnonzero(np.isnan(found.metrics["step"]["settling_time"])).tolist() == [4, 17]
+    assert found.sent_again == tuple(values[:5] + values[15:20])
+    assert found.missing == tuple(missing)
+    assert sorted(built) == [value for value in values if value not in missing]  # each once, and nothing in its place
+    lost = [sent for sent in executor.sizes if set(missing) & set(sent)]
+    assert [len(sent) for sent in lost] == [5, 5, 1, 1, 1, 1]  # sent again twice, one value at a time
+    if workers:
+        assert max(executor.flight) <= 2 * workers
+    assert executor.flight[-2:] == [1, 1]  # the last time with nothing else in flight
+    both = found.merged(swept(lag, missing))
+    assert (both.sent_again, both.missing) == (found.sent_again, found.missing)
 
 
-def test_draws_that_a_worker_takes_with_it_are_named_and_run_nowhere_else():
+def test_draws_of_a_lost_worker_are_sent_again_and_run_nowhere_else():
     tau = np.linspace(0.5, 2.0, 12)
     run = []
     loop = drawn()
@@ -252,29 +298,23 @@ def test_draws_that_a_worker_takes_with_it_are_named_and_run_nowhere_else():
         run.append(float(one.response.outputs[1]))
         return {}
 
-    lost = Losing({3, 11}, RuntimeError("gone"))
+    lost = Killing({tau[11]}, RuntimeError("gone"))
     measures = {"counted": cp.Measure("Counted", of="run", function=measure)}
-    found = cp.monte_carlo(loop, {"tau": tau}, PLANS, TIMES, executor=lost, progress=False, measures=measures)
-    assert len(run) == 3 + 10  # the nominal loop, two draws that are compared with Python, and all but the lost
-    assert [(f.draw, f.params, f.message) for f in found.failures] == [
-        (k, {"tau": tau[k]}, "RuntimeError: gone") for k in (3, 11)
-    ]
-    assert np.flatnonzero(np.isnan(found.metrics["step"]["settling_time"])).tolist() == [3, 11]
+    found = cp.monte_carlo(loop, {"tau": tau}, PLANS, TIMES, executor=lost, progress=False, measures=measures, chunk=3)
+    assert len(run) == 3 + 11  # the nominal loop, two draws that are compared with Python, and all but the lost one
+    assert [(f.draw, f.params, f.message) for f in found.failures] == [(11, {"tau": tau[11]}, "RuntimeError: gone")]
+    assert np.flatnonzero(np.isnan(found.metrics["step"]["settling_time"])).tolist() == [11]
+    assert (found.sent_again, found.missing, found.finished) == ((9, 10, 11), (11,), 12)
+    assert "Draws sent again because their worker ended: 9, 10, 11." in found.notes()
 
 
-def test_an_executor_that_loses_everything_is_heard_of():
-    lost = Losing(range(6), RuntimeError("all gone"))
+def test_an_executor_that_finishes_nothing_raises_its_error():
+    lost = Losing(range(10_000), RuntimeError("all gone"))
     with pytest.raises(RuntimeError, match="all gone"):
-        swept(lag, executor=lost)
+        swept(lag, np.linspace(0.5, 3.0, 400), executor=lost)
+    assert len(lost.tasks) < 4000
     with pytest.raises(RuntimeError, match="all gone"):
-        cp.monte_carlo(
-            drawn(),
-            {"tau": [0.5, 1.0]},
-            PLANS,
-            TIMES,
-            executor=Losing(range(2), RuntimeError("all gone")),
-            progress=False,
-        )
+        cp.monte_carlo(drawn(), {"tau": [0.5, 1.0]}, PLANS, TIMES, executor=lost, progress=False)
 
 
 def test_an_executor_that_takes_no_more_keeps_what_it_has():
@@ -468,7 +508,7 @@ class Cancelled(InTurn):
 
 def test_an_interrupted_wait_keeps_what_is_finished_behind_a_slow_task(monkeypatch):
     """The wait for task 0 is interrupted when 2, 3 and 5 are done, of which nobody was told yet."""
-    from ctrlplan.studies import executing
+    from ctrlplan.studies import executors
 
     class Interrupts:
         def put(self, k):
@@ -477,7 +517,7 @@ def test_an_interrupted_wait_keeps_what_is_finished_behind_a_slow_task(monkeypat
         def get(self, timeout):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(executing, "SimpleQueue", Interrupts)
+    monkeypatch.setattr(executors, "SimpleQueue", Interrupts)
     executor = Cancelled({2, 3, 5})
     with pytest.warns(UserWarning, match="interrupted: 3 of 6 values are returned"):
         found = swept(lag, executor=executor)

@@ -1,0 +1,91 @@
+"""Outcomes of loops built for many values: linear loops of the same structure are solved together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from ctrlplan.studies.alike import Linear
+from ctrlplan.studies.experiment import Experiment
+from ctrlplan.studies.outcomes import Failed, tried
+from ctrlplan.studies.running import Builder, System
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_SAMPLES = 2**19
+"""Maximum number of samples of a signal over all loops that are solved together."""
+
+FIRST = 4
+"""Number of loops solved together at first; doubled each time, so that an interruption discards few results."""
+
+FIRST_OF_TASK = 32
+"""The same in a task of an executor, which an interruption does not end."""
+
+
+@dataclass
+class Batches(Generic[T, R]):
+    """Loops of many values in an experiment.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        Plans, times and measures.
+    build : callable
+        Maps a value to a loop.
+    alone : callable
+        Maps a loop to its outcome.
+    alike : callable or None
+        Maps linear loops of the same structure to the outcome of each; None if
+        every loop is run separately.
+    first : int
+        Number of loops solved together at first.
+    """
+
+    experiment: Experiment
+    build: Callable[[T], System | Builder]
+    alone: Callable[[System | Builder], R]
+    alike: Callable[[Sequence[Linear]], Sequence[R]] | None
+    first: int = FIRST
+    _checked: bool = False
+
+    def outcomes(self, values: Sequence[T], timeout: float | None) -> Generator[tuple[int, R | Failed], None, None]:
+        """Number and outcome of each value.
+
+        The first linear loop in a process is run separately, which checks the
+        arguments for the loop. After a KeyboardInterrupt, outcomes of loops already built follow.
+        """
+        waiting: dict[int, Linear] = {}
+        size = self.first
+        largest = max(2, _SAMPLES // max(1, self.experiment.timepts.size))
+
+        def together() -> Iterator[tuple[int, R | Failed]]:
+            nonlocal size
+            try:
+                found = self.alike(list(waiting.values())) if self.alike is not None and waiting else []
+                yield from zip(waiting, found, strict=True)
+            except Exception:  # of one of them: run each separately
+                for k in waiting:
+                    yield k, tried(lambda value: self.alone(self.build(value)), values[k], timeout)
+            waiting.clear()
+            size = min(2 * size, largest)
+
+        try:
+            for k, value in enumerate(values):
+                loop = tried(self.build, value, timeout)
+                linear = None if self.alike is None or isinstance(loop, Failed) else self.experiment.numbers_of(loop)
+                if linear is None or not self._checked:
+                    outcome = loop if isinstance(loop, Failed) else tried(self.alone, loop, timeout)
+                    self._checked |= linear is not None and not isinstance(outcome, Failed)
+                    yield k, outcome
+                    continue
+                if waiting and not linear.fits(next(iter(waiting.values()))):
+                    yield from together()
+                waiting[k] = linear
+                if len(waiting) >= size:
+                    yield from together()
+            yield from together()
+        except KeyboardInterrupt:  # results of the loops already built
+            yield from together()
+            raise

@@ -1,0 +1,190 @@
+"""Checkpoints: finished outcomes of many runs in the files of a folder."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import os
+import time
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+from uuid import uuid4
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan._files import write_bytes, write_text
+from ctrlplan._types import Array
+from ctrlplan.studies.outcomes import Failed
+
+_STUDY = "study.json"
+_SECONDS = 10.0
+"""Time [s] after which finished outcomes are written, even if they are few."""
+
+_ROUNDING = 1e-6
+"""Relative difference of numbers that identify the same study on different machines."""
+
+Keep: TypeAlias = Callable[[int, Any], None]
+"""Receives the number and outcome of a value."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Folder with the outcomes of the values of a study.
+
+    ``study.json`` identifies the study; each other file has outcomes of some
+    values. Files are written whole: a file that is there is complete. Failures are
+    not stored.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder.
+    """
+
+    folder: Path
+
+    @classmethod
+    def opened(cls, folder: str | os.PathLike[str], study: Mapping[str, object]) -> Checkpoint:
+        """Checkpoint of a study in a folder, which is made if it does not exist.
+
+        Raises
+        ------
+        ValueError
+            If the folder has the checkpoint of another study.
+        OSError
+            If the folder cannot be made or written to.
+        """
+        path = Path(folder)
+        path.mkdir(parents=True, exist_ok=True)
+        known = path / _STUDY
+        if known.exists():
+            found = _json(known, known.read_text(encoding="utf-8"))
+            differ = [name for name in dict.fromkeys((*study, *found)) if not _same(study.get(name), found.get(name))]
+            if differ:
+                raise ValueError(
+                    f"checkpoint must be a folder of the same study, got {path}, which has another in "
+                    f"{', '.join(differ)}; give a new folder, or delete this one"
+                )
+        else:
+            write_text(known, json.dumps(study, indent=1))
+        return cls(path)
+
+    def read(self) -> Iterator[tuple[int, Any]]:
+        """Number and outcome of each value that is stored.
+
+        Raises
+        ------
+        ValueError
+            If a file is damaged.
+        """
+        seen: set[int] = set()
+        for path in sorted(self.folder.glob("outcomes-*.npz")):
+            try:
+                with np.load(io.BytesIO(path.read_bytes())) as file:
+                    stored, data = json.loads(str(file["outcomes"])), file["data"]
+            except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+                raise ValueError(f"checkpoint must have complete files, got {path}: {error}; delete it") from error
+            for number, outcome in stored:
+                if number not in seen:
+                    seen.add(number)
+                    yield number, _restored(outcome, data)
+
+    @contextmanager
+    def keeping(self, size: int) -> Iterator[Keep]:
+        """Context with a function that stores outcomes, in files of a number of values or of ten seconds."""
+        kept: dict[int, Any] = {}
+        since = time.monotonic()
+
+        def keep(number: int, outcome: Any) -> None:
+            nonlocal since
+            if _has_failed(outcome):
+                return
+            kept[number] = outcome
+            if len(kept) >= size or time.monotonic() - since > _SECONDS:
+                self._write(kept)
+                kept.clear()
+                since = time.monotonic()
+
+        try:
+            yield keep
+        finally:
+            if kept:
+                self._write(kept)
+
+    def _write(self, outcomes: Mapping[int, Any]) -> None:
+        arrays = _Arrays()
+        stored = [(number, _plain(outcome, arrays)) for number, outcome in outcomes.items()]
+        file = io.BytesIO()
+        np.savez(file, outcomes=np.array(json.dumps(stored)), data=np.concatenate([np.empty(0), *arrays.pieces]))
+        write_bytes(self.folder / f"outcomes-{min(outcomes):08d}-{uuid4().hex}.npz", file.getvalue())
+
+
+def digest(values: ArrayLike) -> str:
+    """Shape and hash of an array, which identify its values."""
+    array = np.ascontiguousarray(values, dtype=float)
+    return f"{array.shape} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"
+
+
+def _has_failed(outcome: Any) -> bool:
+    """Whether a value, or one of its plans, has failed."""
+    return isinstance(outcome, Failed) or any(isinstance(one, Failed) for one in outcome.values())
+
+
+class _Arrays:
+    """Arrays that are stored as one."""
+
+    def __init__(self) -> None:
+        self.pieces: list[Array] = []
+        self._size = 0
+
+    def add(self, array: Array) -> list[int]:
+        """First and last index of an array in all."""
+        self.pieces.append(array)
+        begin, self._size = self._size, self._size + array.size
+        return [begin, self._size]
+
+
+def _plain(value: Any, arrays: _Arrays) -> object:
+    """Value for JSON, in which arrays, of one axis, are slices of one array."""
+    if isinstance(value, Mapping):
+        return {"of": {name: _plain(one, arrays) for name, one in value.items()}}
+    if isinstance(value, tuple):
+        return [_plain(one, arrays) for one in value]
+    return {"array": arrays.add(value)} if isinstance(value, np.ndarray) else value
+
+
+def _restored(value: Any, data: Array) -> Any:
+    """Value of `_plain`."""
+    if isinstance(value, list):
+        return tuple(_restored(one, data) for one in value)
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        return data[slice(*value["array"])].copy()
+    return {name: _restored(one, data) for name, one in value["of"].items()}
+
+
+def _same(own: object, other: object) -> bool:
+    """Whether two values are equal, numbers to rounding errors."""
+    if isinstance(own, Mapping) and isinstance(other, Mapping):
+        return own.keys() == other.keys() and all(_same(one, other[name]) for name, one in own.items())
+    if isinstance(own, float) and isinstance(other, float):
+        return math.isclose(own, other, rel_tol=_ROUNDING, abs_tol=1e-9) or (math.isnan(own) and math.isnan(other))
+    return own == other
+
+
+def _json(path: Path, text: str) -> dict[str, Any]:
+    try:
+        found = json.loads(text)
+    except ValueError as error:
+        raise ValueError(
+            f"checkpoint must have a complete {path.name}, got {path}: {error}; delete the folder"
+        ) from error
+    return dict(found)

@@ -1,0 +1,44 @@
+"""Ctrl-C while many runs are executed."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from types import FrameType
+
+_PRESSED: ContextVar[Sequence[int]] = ContextVar("pressed", default=())
+"""Signals of Ctrl-C since the runs began."""
+
+
+@contextmanager
+def counting_interruptions() -> Iterator[Sequence[int]]:
+    """Context that records Ctrl-C, since a KeyboardInterrupt raised in a callback may be swallowed.
+
+    Like `asyncio.run`: in the main thread only, and only with the default handler.
+    """
+    pressed: list[int] = []
+    here = threading.current_thread() is threading.main_thread()
+    if not here or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield pressed
+        return
+
+    def record(number: int, frame: FrameType | None) -> None:
+        pressed.append(number)
+        signal.default_int_handler(number, frame)
+
+    token = _PRESSED.set(pressed)
+    signal.signal(signal.SIGINT, record)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        _PRESSED.reset(token)
+
+
+def raise_if_pressed() -> None:
+    """Raise KeyboardInterrupt if there was a signal since the runs began."""
+    if _PRESSED.get():
+        raise KeyboardInterrupt

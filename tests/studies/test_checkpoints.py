@@ -1,0 +1,166 @@
+"""Sweeps and draws with a checkpoint: what is stored is not run again, and another study is rejected."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+
+import control as ct
+import numpy as np
+import pytest
+from ensemble_cases import same_bits
+
+import ctrlplan as cp
+
+TIMES = np.linspace(0.0, 10.0, 101)
+PLANS = {"step": cp.Step(1.0), "ramp": cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1)])}
+RATES = [0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5]
+
+
+def lag(rate):
+    return ct.ss([[-rate]], [[rate]], [[1.0]], [[0.0]], inputs="r", outputs="y")
+
+
+def bent(rate):
+    """The same, which only Python runs."""
+    return ct.nlsys(lambda t, x, u, p: rate * (float(u[0]) - float(x[0])), None, states=1, inputs="r", outputs="y")
+
+
+def swept(build, folder=None, values=RATES, **options):
+    return cp.sweep(build, values, PLANS, TIMES, progress=False, checkpoint=folder, **options)
+
+
+def drawn(build, folder=None, rates=RATES, **options):
+    return cp.monte_carlo(build, {"rate": rates}, PLANS, TIMES, progress=False, checkpoint=folder, **options)
+
+
+def same(one, other):
+    assert one.values.tolist() == other.values.tolist()
+    for plan, rows in one.metrics.items():
+        for name, row in rows.items():
+            np.testing.assert_array_equal(row, other.metrics[plan][name])
+
+
+class Counted:
+    """A builder that records the values it has, and is interrupted at one of them."""
+
+    def __init__(self, build, at=None):
+        self.build, self.at, self.built = build, at, []
+
+    def __call__(self, rate):
+        if rate == self.at:
+            raise KeyboardInterrupt
+        self.built.append(rate)
+        return self.build(rate)
+
+
+@pytest.mark.parametrize("build", [lag, bent])
+@pytest.mark.parametrize("executor", [None, ThreadPoolExecutor])
+def test_only_what_is_missing_runs_in_a_second_call(build, executor, tmp_path):
+    options = {"executor": executor and executor(1), "chunk": 2}
+    with pytest.warns(UserWarning, match="the sweep was interrupted"):
+        first = swept(Counted(build, at=2.5), tmp_path / "new" / "folder", **options)
+    assert first.missing == tuple(rate for rate in RATES if rate not in first.values)
+    again = Counted(build)
+    found = swept(again, tmp_path / "new" / "folder", **options)
+    assert sorted(again.built) == list(first.missing)
+    assert found.values.tolist() == RATES
+    assert found.missing == ()
+    np.testing.assert_allclose(found.metrics["step"]["settling_time"], np.log(50.0) / np.array(RATES), rtol=1e-4)
+    third = Counted(build)
+    same(found, swept(third, tmp_path / "new" / "folder", **options))
+    assert third.built == []
+
+
+def test_draws_are_stored_with_their_signals(tmp_path):
+    expected = drawn(lag)
+    same_bits(expected, drawn(lag, tmp_path))
+
+    def built_once(rate=0.5):
+        if rate != 0.5:
+            raise AssertionError("built again")
+        return lag(rate)
+
+    same_bits(expected, drawn(built_once, tmp_path, executor=ThreadPoolExecutor(1)))
+
+
+def test_values_without_a_finite_metric_are_restored(tmp_path):
+    rates = [-1.0, 0.5, 1.0]  # the first is unstable: its settling time is infinite
+    same(swept(lag, tmp_path, rates), swept(lag, tmp_path, rates))
+
+
+def test_failures_are_run_again(tmp_path):
+    def build(rate):
+        if rate == 1.5:
+            raise ValueError("none yet")
+        return lag(rate)
+
+    assert [f.draw for f in swept(build, tmp_path).failures] == [2]
+    again = Counted(lag)
+    found = swept(again, tmp_path)
+    assert (again.built, found.failures) == ([1.5], ())
+
+
+def test_a_file_has_a_chunk_and_no_other_file_is_left(tmp_path):
+    swept(lag, tmp_path, chunk=3)
+    names = sorted(path.name[:17] for path in tmp_path.iterdir())
+    assert names == ["outcomes-00000000", "outcomes-00000003", "outcomes-00000006", "study.json"]
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        (lambda folder: swept(lag, folder, [0.5, 1.0]), "values"),
+        (lambda folder: swept(lag, folder, band=0.05), "band"),
+        (lambda folder: swept(lag, folder, measures=["iae"]), "measures"),
+        (lambda folder: cp.sweep(lag, RATES, PLANS, TIMES[:-1], progress=False, checkpoint=folder), "timepts"),
+        (
+            lambda folder: cp.sweep(
+                lag, RATES, PLANS | {"step": cp.Step(2.0)}, TIMES, progress=False, checkpoint=folder
+            ),
+            "plans",
+        ),
+        (lambda folder: drawn(lag, folder), "kind, draws, loop, values"),
+    ],
+)
+def test_the_checkpoint_of_another_study_is_an_error(other, said, tmp_path):
+    swept(lag, tmp_path)
+    before = sorted(path.read_bytes() for path in tmp_path.iterdir())
+    with pytest.raises(ValueError, match=f"checkpoint must be a folder of the same study, .* in {said}; give a new"):
+        other(tmp_path)
+    assert sorted(path.read_bytes() for path in tmp_path.iterdir()) == before
+
+
+def test_draws_of_another_loop_are_an_error(tmp_path):
+    drawn(lag, tmp_path)
+    with pytest.raises(ValueError, match=r"checkpoint must be a folder of the same study, .* in loop; give a new"):
+        drawn(lambda rate: lag(2.0 * rate), tmp_path)
+
+
+def test_a_damaged_file_is_an_error(tmp_path):
+    swept(lag, tmp_path)
+    (file,) = tmp_path.glob("outcomes-*.npz")
+    file.write_bytes(file.read_bytes()[:-40])
+    with pytest.raises(ValueError, match=r"checkpoint must have complete files, got .*outcomes-.*; delete it"):
+        swept(lag, tmp_path)
+    (tmp_path / "study.json").write_text("{")
+    with pytest.raises(ValueError, match=r"checkpoint must have a complete study.json, got "):
+        swept(lag, tmp_path)
+
+
+def test_the_version_is_part_of_the_study(tmp_path):
+    swept(lag, tmp_path)
+    path = tmp_path / "study.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"version of ctrlplan": "0.0.1"}))
+    with pytest.raises(ValueError, match="in version of ctrlplan; give a new"):
+        swept(lag, tmp_path)
+
+
+@pytest.mark.parametrize("folder", [3, True, ["a"]])
+def test_a_checkpoint_is_a_path(folder):
+    with pytest.raises(TypeError, match="checkpoint must be the path of a folder, or None, got"):
+        swept(lag, folder)
+
+
+def test_a_file_is_no_folder(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(FileExistsError):
+        swept(lag, tmp_path / "file")
