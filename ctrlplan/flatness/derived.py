@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -241,7 +242,7 @@ class DerivedFlatSystem(FlatSystem):
         below, _, last = rows_of(values, self.orders)
         p = self._values(self.params)
         trailing = below.shape[1:]
-        z = self._states(below.reshape(len(below), -1), p)
+        z = self._states_or_nan(below.reshape(len(below), -1), p)
         x = z[: self.maps.nstates]
         if known:
             found = self.signals(x, self.maps.inputs_of(z, last.reshape(len(last), -1), p)[1])
@@ -371,6 +372,17 @@ class DerivedFlatSystem(FlatSystem):
                 z[:, k] = near
                 left = left[1:]
         z[self._angles] = np.unwrap(z[self._angles])
+        return z
+
+    def _states_or_nan(self, flags: Array, p: Array) -> Array:
+        """Extended states (nz, n) of flags (nz, n); nan at rest if they are not determined there."""
+        still = at_rest(self.maps.orders, flags)
+        z = np.full(flags.shape, np.nan)
+        if not still.all():
+            z[:, ~still] = self._states(flags[:, ~still], p)
+        if still.any():
+            with suppress(ValueError):
+                z[:, still] = self._states(flags[:, still], p)
         return z
 
     def _is_regular(self, z: Array, p: Array) -> bool:
