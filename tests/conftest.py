@@ -65,10 +65,9 @@ def pytest_collection_finish():
     gc.freeze()
 
 
-@pytest.fixture(autouse=True)
-def _no_figure_is_left_open():
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown():
     """Close what a test has drawn: pyplot keeps figures, and warns after twenty."""
-    yield
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
 

@@ -35,6 +35,9 @@ Array = NDArray[np.float64]
 
 _LIMIT = "#8a3c00"
 
+_ROUNDING = 1e-12
+"""Range of a signal relative to its magnitude that counts as rounding."""
+
 
 def plot_alpha_choice(choice: AlphaChoice, *, ax: AxesLike | None = None) -> ControlPlot:
     """Objective versus alpha up to the value where it diverges, with the choice marked.
@@ -103,7 +106,8 @@ def plot_limits(
         margin = next(found for found in rows if found.of(bound))
         if margin.time <= t[-1]:
             axes.plot(margin.time, margin.value, "o", color=_LIMIT, markersize=marker_size(5))
-        span = float(np.ptp(row)) or abs(float(row[0])) or 1.0
+        span, size = float(np.ptp(row)), float(np.abs(row).max())
+        span = span if span > _ROUNDING * size else size or 1.0
         for side in limited.sides(bound, plan, t):
             # A distant limit would flatten the curve; the title gives its value.
             near = np.minimum(np.abs(side - row.min()), np.abs(side - row.max())) < 1.5 * span

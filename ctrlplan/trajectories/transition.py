@@ -142,7 +142,7 @@ class Transition(Displayed, Fields):
         return values * derivative_scale(self.horizon, order)[:, None, None]
 
     def enclosure(self, nu: int) -> Array | None:
-        """Matrix from coefficients to values whose extremes enclose the nu-th derivative.
+        """Matrix from coefficients to bounds of the nu-th derivative.
 
         Of shape (nvalues, 2 (order + 1)): Bernstein coefficients on parts of the
         horizon. None if `alpha` is not 0.

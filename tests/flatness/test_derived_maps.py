@@ -485,6 +485,7 @@ def test_grids_of_plans_with_axes_in_another_order_are_kept():
     assert plan.labels == ("y", "x")
 
 
+@pytest.mark.slow
 def test_other_values_of_parameters():
     """A crane with another load: that of the maps by formulas, for all that python-control calls as well."""
     crane, heavy = cp.plants.Crane(), cp.plants.Crane(load_mass=700.0)

@@ -135,6 +135,7 @@ def test_a_slalom_between_walls_without_end(family):
 LATE = Rectangle((8.0, 15.0), (35.0, 60.0)), cp.HalfPlane((0.0, 1.0), 52.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["polynomial", "piecewise"])
 @pytest.mark.parametrize("gap", one_in(5, [0.0, 0.01, 0.1, 0.5, 1.0]))
 def test_a_wall_that_must_be_passed_far_below(family, gap):

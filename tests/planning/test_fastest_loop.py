@@ -184,6 +184,7 @@ def test_sum_of_signals_is_a_region():
     assert whole.duration == pytest.approx(difference.duration, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_root_mean_square_with_a_value():
     """The root mean square of the speed is that of the samples, and decides where it is violated longest."""
     loop = ct.ss(SERVO_MATRICES[0], SERVO_MATRICES[1][0], np.eye(2), np.zeros((2, 1)), inputs="r", outputs=["y", "v"])

@@ -232,6 +232,7 @@ def test_the_names_of_objectives_are_their_type():
     assert set(get_args(ObjectiveName)) == set(OBJECTIVES)
 
 
+@pytest.mark.slow
 def test_an_objective_of_a_users_own_may_declare_its_size():
     """Excess of a fraction: what ties is a part of 1, not of a minimum that is nearly 0."""
 

@@ -159,6 +159,7 @@ def draws(count, ranges):
     return [dict(zip(rows, values, strict=True)) for values in zip(*rows.values(), strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [300, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_no_draw_is_worse_than_what_is_proved(count):
     ranges = {"load_mass": (300.0, 800.0), "trolley_mass": (4e3, 7e3), "drum_inertia": (30.0, 80.0)}

@@ -62,6 +62,7 @@ def test_margins_over_the_whole_path(flat):
         assert abs(found[name].value) >= peak(name) * (1.0 - 1e-9)
 
 
+@pytest.mark.slow
 def test_the_same_margins_from_equations():
     pytest.importorskip("casadi")
     from flat_plants import car, car_rate
@@ -77,6 +78,7 @@ def test_the_same_margins_from_equations():
             assert row.value == pytest.approx(own[known], rel=1e-8, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_with_fixed_shape_the_duration_is_that_of_the_powers_of_time():
     """Of degree 1 in the pace: speed and steering rate; of degree 2: acceleration."""
     limits = {"v": cp.Limits(-2.0, 2.0, rate=0.4), "delta": cp.Limits(-1.0, 1.0, rate=0.3)}
@@ -123,6 +125,7 @@ def duration_at(fastest):
 REGION = cp.Region(("v", "delta"), [(2, 0), (0.5, 0.9), (-0.5, 0.9), (-2, 0), (-0.5, -0.9), (0.5, -0.9)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "fastest"),
     [
@@ -216,6 +219,7 @@ def test_what_is_no_vehicle_and_what_is_no_path():
         cp.margins(PLAN, {"speed": 1.0}, FLAT)
 
 
+@pytest.mark.slow
 def test_limits_of_derivatives_need_no_vehicle():
     for system in (None, lambda jet: {"kinetic": jet[1, 0] ** 2 + jet[1, 1] ** 2}):
         limits = {"velocity": 1.0} | ({} if system is None else {"kinetic": (None, 1.5)})

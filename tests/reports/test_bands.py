@@ -97,6 +97,7 @@ def test_a_row_is_a_signal_and_a_column_a_plan(grid):
     assert {axes.get_xlabel() for axes in grid[-1]} == {"time [s]"}
 
 
+@pytest.mark.slow
 def test_bands_are_drawn_as_they_are(grid):
     for axes, (plan, curves) in zip(grid[0], responses().items(), strict=True):
         expected = np.quantile(curves, LEVELS, axis=0)
@@ -226,6 +227,7 @@ def test_the_page_has_the_table_of_draws_before_that_of_the_loop(page):
     assert next(nominal.all("tbody")) is not None
 
 
+@pytest.mark.slow
 def test_the_page_shows_bands_and_responses(page):
     figures = {figure.attributes["id"]: figure for figure in page.all("figure") if "id" in figure.attributes}
     assert list(figures) == ["draws-bands", "draws-responses"]

@@ -548,6 +548,7 @@ def test_a_page_of_many_figures_warns_of_none(backend, windows):
     assert plt.get_fignums() == []
 
 
+@pytest.mark.slow
 def test_a_page_does_not_draw_in_an_empty_figure_of_the_user():
     figure = plt.figure()
     render_page([Study("it", "It", compared(), sections=(PlanCurves(),))], "It")

@@ -106,6 +106,7 @@ def test_a_section_of_ones_own_is_on_the_page_in_its_place(own, read):
     ]
 
 
+@pytest.mark.slow
 def test_a_table_of_ones_own_has_its_cells_and_marks(own, read):
     page = read(own[0].read_text(encoding="utf-8"))
     (table,) = page.all("table", class_="durations")

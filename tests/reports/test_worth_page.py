@@ -111,6 +111,7 @@ def test_sections_are_there_only_where_they_were_asked_for(shown):
     assert not {FASTEST, WORTH, OPTIMAL} & set(heads(plain))
 
 
+@pytest.mark.slow
 def test_nothing_is_left_to_fill_in_and_nothing_is_undefined(html, page):
     words = page.words()
     assert not re.search(r"\{\w*\}|\{\{|\{%|\bnan\b|\bNone\b|\binf\b", words)

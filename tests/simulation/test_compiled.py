@@ -197,6 +197,7 @@ def test_a_crane_behind_its_drives(case, method):
         assert {o.kind for o in found.events if o.name == "F"} == {"below", "above", "inside"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_crane_under_the_whole_law(method):
     loop = cp.plants.crane_loop(CRANE, crane_plan(), "dynamic")

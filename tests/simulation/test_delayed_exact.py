@@ -59,6 +59,7 @@ def by_series(cell, end, delays, rows, plan, state, times):
     return np.array(found).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delays", [(0.4,), (0.4, 0.6), (0.05, 0.6)])
 def test_delays_between_continuous_blocks(delays):
     """The plan begins and ends inside of cells, and comes back after every sum of the delays."""

@@ -642,6 +642,7 @@ def test_a_discrete_system_is_not_compiled():
         cp.simulate(HELD, [0.0, 0.1], 1.0, method="compiled")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["compiled", "python"])
 def test_the_memory_of_a_sampled_block_is_not_integrated(method, monkeypatch):
     """A delay line of 400 samples before an integrator: the equations that are integrated have one state."""

@@ -160,6 +160,7 @@ def test_without_a_method_every_reason_is_given(monkeypatch):
         cp.simulate(discrete, [0.0, 0.1])
 
 
+@pytest.mark.slow
 def test_the_predictor_takes_the_same_methods(monkeypatch):
     loop = ct.nlsys(
         lambda t, x, u, params: np.array([x[1], 4 * (u[0] - x[0]) - 3 * x[1]]),

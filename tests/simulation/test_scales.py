@@ -317,6 +317,7 @@ def calls_of_a_car_with_a_noisy_signal(size):
     return calls
 
 
+@pytest.mark.slow
 def test_a_large_state_that_nothing_depends_on_is_not_integrated_more_closely():
     small, large = (calls_of_a_car_with_a_noisy_signal(size) for size in (1.0, 1e8))
     assert large < 2 * small

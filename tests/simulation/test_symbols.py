@@ -264,6 +264,7 @@ def test_threads_leave_nothing_changed_and_agree(mode, numpy_mode):
     assert float(ca.SX(1.0)) == 1.0
 
 
+@pytest.mark.slow
 def test_threads_share_a_prepared_form():
     """Integrators of one form for many patterns of times, from eight threads."""
     ready = cp.prepare(pendulum(2.0))

@@ -163,6 +163,7 @@ def test_a_step_ends_where_the_rope_goes_slack(nominal):
     assert nominal.responses["polynomial"].time[-1] == 30.0
 
 
+@pytest.mark.slow
 def test_what_a_step_did_outside_the_model_is_not_reported(nominal):
     row = nominal.results()["plans"]["step"]["metrics"]
     assert row["error_after"] is None

@@ -82,6 +82,7 @@ def test_what_is_no_distribution_is_refused(what):
 # Against closed forms
 
 
+@pytest.mark.slow
 def test_metrics_are_those_of_the_closed_form(found):
     tau, end = LAGS["tau"], TIMES[-1]
     assert found.ndraws == found.finished == 21

@@ -161,6 +161,7 @@ def test_a_draw_that_fails_is_recorded_and_the_others_stand():
     np.testing.assert_allclose(result.quantiles("settling_time")["step"], np.log(50) * tau[[0, 0, 1, 3, 4]], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_draw_that_explodes_is_recorded_and_the_others_stand(exploded):
     assert [(f.draw, f.params) for f in exploded.failures] == [(2, {"k": 0.5})]
     k = np.array([0.01, 0.05, 0.09])

@@ -60,11 +60,14 @@ def test_there_is_a_kind_for_each_loop_and_each_way_of_planning():
     assert study_kinds()[0] == "linear"
 
 
+EVERYDAY = {"linear", "crane", "draws", "kinematic-car"}
+
+
 @pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(kind, marks=pytest.mark.slow if kind in PLANTS - {"kinematic-car"} else ())
+        pytest.param(kind, marks=() if kind in EVERYDAY else pytest.mark.slow)
         for kind in study_kinds()
         if kind not in PLANTS - RUN
     ],

@@ -109,6 +109,7 @@ def test_the_governed_crane_always_finds_an_admissible_reference(governed):
     np.testing.assert_array_equal(curves.rows["simulated"], signals["F"] / 1e3)
 
 
+@pytest.mark.slow
 def test_the_force_predicted_at_the_motion_of_the_load_is_that_of_the_simulation(governed):
     """Linearised at the true depth, or at the mean depth for the same motion; for other states it is far beyond."""
     force, found, states = governed

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import settings
 
 settings.register_profile("whole", deadline=None, derandomize=True, print_blob=True, max_examples=100)
-settings.register_profile("everyday", settings.get_profile("whole"), max_examples=25)
+settings.register_profile("everyday", settings.get_profile("whole"), max_examples=15)
 
 
 def load(everyday):
@@ -13,7 +13,7 @@ def load(everyday):
 
 
 def examples(number):
-    """Settings of a test with so many examples in the whole suite, and in the everyday run a quarter, at least 5."""
+    """Settings of a test with so many examples in the whole suite, and in the everyday run a seventh, at least 5."""
     return settings(max_examples=min(number, max(5, number * settings.default.max_examples // 100)))
 
 

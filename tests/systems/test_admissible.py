@@ -186,6 +186,7 @@ def test_every_later_time_follows():
                 assert -maximum.fun <= limit + 1e-6
 
 
+@pytest.mark.slow
 def test_no_row_is_superfluous():
     found = cp.AdmissibleSet(second_order(0.3), {"y": (-1.0, 1.0)}, 0.1)
     rows = np.hstack([found.state_matrix, found.reference_matrix])

@@ -174,6 +174,7 @@ def test_copies_are_whole(again):
         np.testing.assert_array_equal(got, expected)
 
 
+@pytest.mark.slow
 def test_a_law_of_the_crane_needs_its_extension():
     """Static feedback does not linearise the crane: its law has the tension and its rate as states."""
     law = cp.create_flat_iosystem(Crane().flat_system(), [[-1, -2, -3, -4]] * 2)

@@ -145,6 +145,7 @@ def test_integral_action_leaves_no_steady_offset(quasi_static):
     assert offsets[True] < 1e-6
 
 
+@pytest.mark.slow
 def test_the_extension_starts_where_it_is_told_to():
     flat = cp.flat_system(CRANE.iosystem(), ["x", "z"], at={"R": 10.0})
     law = cp.create_flat_iosystem(flat, [FAST, FAST], start=[600.0, 3.0])

@@ -200,7 +200,7 @@ def test_bands_of_zeros(zero, accepted):
 # Zero phase error tracking
 
 
-class Sine(Trajectory):
+class _Sine(Trajectory):
     """Sine over some seconds."""
 
     rate: float
@@ -225,7 +225,7 @@ class Sine(Trajectory):
 
 @pytest.mark.parametrize(("frequency", "gain"), [(2.0, 0.99736), (10.0, 0.93606)])
 def test_its_gain_at_a_frequency(frequency, gain):
-    dt, plan = 0.01, Sine(2.0 * np.pi * frequency, 2.0)
+    dt, plan = 0.01, _Sine(2.0 * np.pi * frequency, 2.0)
     block, times, found, _ = followed(sampled([1], [1, 3, 3, 1], dt), plan, 0.5, dt, method="zpetc")
     inside = (times > 0.2) & (times < 1.8)
     ratio = found.outputs[0, inside] @ plan(times[inside]) / np.sum(plan(times[inside]) ** 2)

@@ -200,6 +200,7 @@ def test_a_set_point_is_a_plan_at_rest():
     np.testing.assert_allclose(cp.simulate(loop, t).outputs["angle"], 2.0 + np.exp(np.outer(t, p)) @ c, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_equality_with_zero_is_no_switch():
     """A law evaluates elsewhere where all its inputs are 0: this makes no breakpoints where one of them crosses 0."""
     flat = crane()
@@ -229,6 +230,7 @@ def test_weights_that_are_not_symmetric_or_finite(q, message, size):
         cp.flat_loop(cp.flat_system(plant, "p"), plan, law=law)
 
 
+@pytest.mark.slow
 def test_a_law_of_measured_outputs_with_an_observer_of_python_control():
     """Positions of two masses are measured; an estimator by `create_estimator_iosystem` gives the law its states.
 

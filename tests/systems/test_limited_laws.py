@@ -57,6 +57,7 @@ def peak_after(torque, error, limits):
     return T[left], float(np.hypot(*error[:, left[0] :]).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heavier", [1.0, pytest.param(1.02, marks=pytest.mark.slow)])
 def test_extension_and_integrals_follow_what_is_applied(heavier):
     """A load 1 m above its plan that is lowered by at most 50 Nm: its weight and 4 % of it."""

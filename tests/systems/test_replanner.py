@@ -52,6 +52,7 @@ def test_compiled_and_python_agree(rich):
     assert [str(e) for e in one.events] == [str(e) for e in other.events]
 
 
+@pytest.mark.slow
 def test_the_loop_of_two_axes_gets_to_its_goals(rich):
     _, runs = rich
     assert np.abs(runs["compiled"].outputs[:2, -1] - [3.5, -0.6]).max() <= 2e-2
@@ -245,6 +246,7 @@ def test_no_label_meets_a_name_inside():
     assert np.abs(found.outputs - plan(t)).max() <= 1e-10
 
 
+@pytest.mark.slow
 def test_joined_to_a_plant_by_names():
     """The reference goes to the plant, its position back, and nothing warns; the goal is met after a push."""
     replanner = cp.create_replanner_iosystem(PLAN, 0.1, measured=0, goal_derivatives=0, derivatives=1, suffix="_r")

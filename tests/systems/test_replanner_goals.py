@@ -208,6 +208,7 @@ def test_deviation_fits_only_above_the_threshold():
     assert state_of(found, "fits")[0] == 0
 
 
+@pytest.mark.slow
 def test_a_distance_below_the_threshold_is_let_be():
     """Drift of 1.0 in all, the threshold at 1.01; without a trigger there are as many fits as periods."""
     _, found = drifting((0.06, 0.08), trigger="deviation", threshold=1.01)

@@ -85,6 +85,7 @@ def test_it_may_fall_during_the_stop():
     np.testing.assert_allclose(found.outputs[0, within], stopped(RUN[within]), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_it_stops_from_a_correction_in_force():
     """The goal has moved before: the reference, not the plan, is stopped."""
     goal = cp.Step(2.0, 1.0, 2.0)
@@ -139,6 +140,7 @@ def test_a_stop_that_is_too_long_leaves_the_goal_out_of_reach():
     assert happened(found, UNREACHABLE)
 
 
+@pytest.mark.slow
 def test_a_way_on_that_violates_limits_is_rejected():
     peak = {1: 1.05 * PLAN.peak(1)[0]}
     found = run(PLAN, {"stop": pressed(3.0, 8.0)}, limits=peak)

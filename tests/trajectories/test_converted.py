@@ -374,6 +374,7 @@ def test_states_that_are_not_finite_are_rejected():
         cp.as_trajectory(straight(0.0, 10.0, -0.5), 5.0, 15.0, signals=["delta"])
 
 
+@pytest.mark.slow
 def test_states_that_are_not_resolved_are_rejected():
     """The heading jumps by pi as the car reverses, between samples."""
     with pytest.raises(ValueError, match=r"resolved to 1e-06 of their range, got a deviation of .* of theta with"):

@@ -113,6 +113,7 @@ def test_a_short_segment_costs_no_digits(where, alpha, size, gap):
     check(times, [jets], size, alpha)
 
 
+@pytest.mark.slow
 def test_several_axes_and_entries_given_inside():
     """Two axes of one pattern and one of another, three durations of segments six powers of ten apart."""
     times = [10.0, 10.0 + 2.0**-20, 10.5, 10.5 + 2.0**-10, 12.0]
