@@ -158,3 +158,26 @@ def test_limits_must_contain_the_inputs_at_rest():
         ValueError, match=r"limits\['C'\] must contain the input .* at rest at 0 s, -1226\.25, got -100"
     ):
         cp.flat_loop(FLAT, lift(), poles=POLES, limits={"C": (-100.0, 100.0)})
+
+
+def test_limits_at_every_heading():
+    """A vehicle on almost a full circle at 1 m/s, from 1 m behind: the pairing of outputs and inputs changes."""
+    flat = cp.flat_system(CASES["unicycle"].plant, ["x", "y"], at={"v": 1.0})
+    t = np.linspace(0.0, 12.0, 49)
+    plan = cp.PiecewiseSpline(
+        [
+            cp.Waypoint.from_jets(
+                time,
+                x=[2.0 * np.sin(a), np.cos(a), -0.5 * np.sin(a)],
+                y=[2.0 - 2.0 * np.cos(a), np.sin(a), 0.5 * np.cos(a)],
+            )
+            for time, a in zip(t.tolist(), 0.5 * t, strict=True)
+        ]
+    )
+    limits = {"v": (0.2, 1.3), "w": (-1.5, 1.5)}
+    loop = cp.flat_loop(flat, plan, poles=[[-2.0, -3.0]] * 2, limits=limits, initial_state=[-1.0, 0.0, 0.0])
+    found = cp.simulate(loop, t, method="compiled")
+    assert found.outputs["v"].max() <= 1.3
+    error = np.hypot(*(np.array([found.outputs["x"], found.outputs["y"]]) - plan(t)))
+    assert error.max() <= 1.0 + 1e-9
+    assert error[-1] < 1e-6
