@@ -315,6 +315,9 @@ def _coincide(one: Line2D | None, other: Line2D | None, scale: Transform, height
 _BEYOND = 0.5
 """Part of the range of the other curves by which a step may exceed it without being clipped."""
 
+_NEGLIGIBLE = 1e-8
+"""Range of the other curves, relative to that of a step, below which they show errors of a simulation only."""
+
 
 def clip_steps(axes: Axes, roles: Mapping[str, Role]) -> None:
     """Scale the y axis by the curves that are no steps; the peak of a step beyond them is written above the axes.
@@ -337,6 +340,8 @@ def clip_steps(axes: Axes, roles: Mapping[str, Role]) -> None:
     beyond = []
     for line in curves:
         first, last = _range_of([line], scale)
+        if span < _NEGLIGIBLE * (last - first):
+            return
         if str(line.get_label()) in steps and (first < low - _BEYOND * span or last > high + _BEYOND * span):
             values = np.asarray(line.get_ydata(), dtype=float)
             peak = values[np.nanargmax(np.where(np.isfinite(values), np.abs(values), -1.0))]

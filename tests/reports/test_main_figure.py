@@ -82,6 +82,7 @@ def test_each_clipped_step_is_named_in_full():
         {"a": [0.0, 1.0, 200.0], "b": [0.0, 1.0, 2.0]},  # no step
         {"step": [0.0, 300.0, 1.0]},  # nothing else
         {"step": [0.0, 300.0, 1.0], "a": [1.0, 1.0, 1.0]},  # which has no range
+        {"step": [0.0, 300.0, 1.0], "a": [0.0, 1e-6, 0.0]},  # an error of the simulation
     ],
 )
 def test_nothing_else_is_clipped(curves):
