@@ -12,6 +12,7 @@ import ctrlplan as cp
 from ctrlplan.studies.ensemble import LEVELS
 from ctrlplan.studies.experiment import Experiment
 
+FEW = TIMES[::4]
 DRAWS = cp.draws(17, seed=2, gain=(2.0, 9.0), pole=(0.5, 1.5))
 
 
@@ -57,12 +58,12 @@ def solved(monkeypatch):
 
 
 def test_draws_of_linear_loops_are_solved_together_and_equal_those_alone(solved, monkeypatch):
-    together = run(servo, DRAWS)
+    together = run(servo, DRAWS, times=FEW)
     assert sum(solved) == 16  # all but the first, which checks the arguments
     assert len(solved) <= 3
     monkeypatch.setattr(Experiment, "numbers_of", lambda *_: None)
     solved.clear()
-    close(together, run(servo, DRAWS))
+    close(together, run(servo, DRAWS, times=FEW))
     assert solved == []
 
 
@@ -76,9 +77,9 @@ def test_metrics_and_bands_of_linear_draws_are_those_of_the_closed_form():
 
 @pytest.mark.parametrize("executor", [Elsewhere, lambda: ThreadPoolExecutor(2)], ids=["tasks", "threads"])
 def test_draws_of_linear_loops_are_solved_together_in_tasks(executor, solved):
-    here = run(servo, DRAWS)
+    here = run(servo, DRAWS, times=FEW)
     solved.clear()
-    close(here, run(servo, DRAWS, executor(), chunk=6), 1e-14)
+    close(here, run(servo, DRAWS, executor(), times=FEW, chunk=6), 1e-14)
     assert sum(solved) >= 14
 
 
