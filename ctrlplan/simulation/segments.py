@@ -209,8 +209,7 @@ def integrate(
     memory, schedule, rounding = course.memory, course.schedule, course.rounding
     shortest, longest = _lengths(network, memory.delays, last - first, stops_after is not None)
     known: list[tuple[Array, Array]] = []  # times and states of each segment, without its end
-    segments: list[tuple[float, Series]] = []
-    span: list[Series] = []
+    segments, span = list[tuple[float, Series]](), list[Series]()
     left, reach = first, longest
     x = schedule.sample(equations, first, state)
     while left < last:

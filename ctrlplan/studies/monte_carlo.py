@@ -148,9 +148,8 @@ def monte_carlo(
     collected = _Collected(drawn, results, again is not None)
 
     def identity() -> dict[str, object]:
-        tables = {name: digest(values) for name, values in table.items()}
-        own = {"kind": "monte_carlo", "draws": tables, "loop": nominal.metrics, "units": dict(units or {})}
-        return own | experiment.identity()
+        own = {"kind": "monte_carlo", "loop": nominal.metrics, "units": dict(units or {})}
+        return own | {"draws": {name: digest(values) for name, values in table.items()}} | experiment.identity()
 
     done = executed(runs, drawn, collected.add, execution, "draws", identity)
     done.raise_if_none_ran("the loop")

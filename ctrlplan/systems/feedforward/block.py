@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import control as ct
 import numpy as np
@@ -13,6 +14,9 @@ from ctrlplan._display import Displayed, Facts, Part, number
 from ctrlplan._types import Array, System
 from ctrlplan.systems.feedforward.zeros import zero_list
 from ctrlplan.traits import declare
+
+Method: TypeAlias = Literal["exact", "zpetc"]
+"""How zeros that are not cancelled are treated."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,7 +29,7 @@ class Accuracy:
     zeros: NDArray[np.complex128]
     loop_state: Array
     stable: bool
-    method: str = "exact"
+    method: Method = "exact"
     remaining: tuple[tuple[float, Array], ...] = ()
     end_command: Array | None = None
     gain: tuple[float, float] | None = None
@@ -74,7 +78,7 @@ class PlannedFeedforward(Displayed, ct.InterconnectedSystem):  # type: ignore[mi
 
     start: float
     preview: float
-    method: str
+    method: Method
     error: float
     zeros: NDArray[np.complex128]
     loop_state: Array

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import control as ct
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from ctrlplan._checks import check_kind, checked_finite, checked_labels, checked_names
 from ctrlplan._renamed import former_signature
 from ctrlplan._types import Array, System
-from ctrlplan.systems.feedforward.block import PlannedFeedforward
+from ctrlplan.systems.feedforward.block import Method, PlannedFeedforward
 from ctrlplan.systems.feedforward.discrete import discrete_feedforward
 from ctrlplan.systems.feedforward.inverse import loop_inverse
 from ctrlplan.systems.feedforward.planned import PlanOptions, planned_feedforward
@@ -29,7 +28,7 @@ def create_feedforward_iosystem(
     plan: Trajectory | None = None,
     error: float = 1e-6,
     preview: float | None = None,
-    method: Literal["exact", "zpetc"] = "exact",
+    method: Method = "exact",
     finite: bool = False,
     labels: Sequence[str] | str | None = None,
     suffix: str = "_ref",
@@ -207,7 +206,7 @@ def create_feedforward_iosystem(
 
 
 def _checked_options(
-    plan: Trajectory | None, error: float, preview: float | None, method: str, finite: bool
+    plan: Trajectory | None, error: float, preview: float | None, method: Method, finite: bool
 ) -> PlanOptions:
     """Arguments for a plan, checked."""
     if plan is not None:

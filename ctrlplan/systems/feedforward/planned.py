@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
-from ctrlplan.systems.feedforward.block import Accuracy, PlannedFeedforward
+from ctrlplan.systems.feedforward.block import Accuracy, Method, PlannedFeedforward
 from ctrlplan.systems.feedforward.inverse import Inverse, loop_inverse
 from ctrlplan.systems.feedforward.preview import continuous_motion, preview_of
 from ctrlplan.systems.feedforward.states import Dynamics, unstable_states
@@ -42,7 +42,7 @@ class PlanOptions:
 
     error: float = 1e-6
     preview: float | None = None
-    method: str = "exact"
+    method: Method = "exact"
     finite: bool = False
 
 
