@@ -544,7 +544,7 @@ def _is_over_time(bound: Bound) -> bool:
 
 
 def _at_its_limit(plan: Trajectory, limited: Limited) -> Fastest | None:
-    """Plan of fixed shape near a duration at which its active limit is attained; None if it is not found at once.
+    """Plan of fixed shape near a duration at which its active limit is attained; None if not found in a few steps.
 
     The duration is that at which the signal at the time of its extremum attains the limit.
     """

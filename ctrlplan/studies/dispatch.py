@@ -86,7 +86,7 @@ class Dispatch(Generic[T, R]):
     executor : Executor
         Where they run.
     workers : int or None
-        Number of workers; None to ask the executor.
+        Number of workers; None for that of the executor.
     size : int
         Number of values of a task.
     timeout : float or None

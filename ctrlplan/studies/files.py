@@ -244,7 +244,7 @@ class StudyFile:
         try:
             if isinstance(loop, FlatLoops):
                 for name, plan in self.plans.items():
-                    loop.check_end(name, plan, self.t_end)
+                    loop.check_end(plan, name, self.t_end)
                     if self.benefit:
                         loop.check_benefit(plan)
             experiment = Experiment(self.plans, self.timepts(loop), waypoints=self.waypoints, **fields_of)

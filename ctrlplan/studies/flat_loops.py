@@ -80,7 +80,7 @@ class FlatLoops:
         controls = tuple(self.flat.input_labels)
         return {"controls": controls} | stated, replace(choices, quantities=self.flat)
 
-    def check_end(self, name: str, plan: Trajectory, end: float) -> None:
+    def check_end(self, plan: Trajectory, name: str, end: float) -> None:
         """Raise for a plan that ends in motion before the end of the run where the plant has no equilibrium."""
         if plan.end < end and any(jump.order == 1 and jump.time == plan.end for jump in plan.jumps(1)):
             self._state_at_rest(name, plan, plan.final, f"end at rest, or at t_end = {end:g} s, got {plan.end:g} s,")

@@ -197,7 +197,7 @@ class NewtonSystem(Fields):
         return found
 
     def coefficients_of_many(self, taylor_data: NDArray[Any]) -> Array:
-        """The same for many columns, by one product where that loses no digits."""
+        """The same for many columns, by one product where that is as accurate."""
         if self._inverse is None or taylor_data.dtype != np.float64:
             return self.coefficients_of(taylor_data)
         offset = taylor_data[self._anchor].copy()

@@ -17,6 +17,9 @@ from ctrlplan.trajectories.trajectory import Trajectory
 _SERIES = 12
 """Number of terms of the series of sinh(x)/x, which has all digits for x^2 of at most 4."""
 
+_LARGEST = 1e100
+"""Largest number of which squares and products are within floating point."""
+
 
 class TimeLaw(Trajectory):
     r"""Time law with a piecewise quadratic squared rate.
@@ -90,6 +93,8 @@ class TimeLaw(Trajectory):
             raise ValueError(
                 f"squared_rates must be finite numbers of shape (3, {places.size - 1}), got shape {table.shape}"
             )
+        if max(np.abs(places).max(), np.abs(table).max()) > _LARGEST:
+            raise ValueError(f"positions and squared_rates must be at most {_LARGEST:g}, within floating point")
         smallest = _smallest(table)
         if not ((table[[0, 2]] >= 0.0).all() and (smallest > 0.0).all()):
             cell = int(np.minimum(smallest, table[[0, 2]].min(axis=0)).argmin())

@@ -58,7 +58,7 @@ def test_the_flag_holds_the_load_s_derivatives_under_held_inputs(wrap, state, in
     """Against a polynomial of degree 8 through the positions of the load on a path integrated here."""
     crane = Crane(**ODD, rope_wrap=wrap)
     flag = crane.flat_system().forward(state, inputs)
-    step = 0.05
+    step = 0.025
     positions = np.array([load(crane, x) for x in along(crane, state, inputs, step, 4)])
     times = step * np.arange(-4, 5)
     for axis in (0, 1):

@@ -67,7 +67,9 @@ def test_breakpoints_belong_to_what_follows(plan, count):
         if k:
             assert (np.abs(found.jet(t, 3, left=True) - before) <= 1e-9 * scale).all()
     many = found.jet(times, 3)
-    np.testing.assert_array_equal(many, np.stack([found.jet(t, 3) for t in times], axis=2))
+    size = np.abs(plan.jet(plan.breakpoints, 3)).max(axis=2, keepdims=True)
+    apart = np.abs(many - np.stack([found.jet(t, 3) for t in times], axis=2))
+    assert (apart <= 16 * np.finfo(float).eps * size).all()  # products of matrices round differently for many times
 
 
 def test_breakpoints_between_are_half_open_and_complete():
