@@ -42,7 +42,7 @@ _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 NOWHERE = np.empty(0, dtype=np.intp)
 
-_known: ContextVar["dict[object, tuple[Array, Array, Pieces]] | None"] = ContextVar("_known", default=None)
+_known: ContextVar["dict[tuple[bytes, bytes], Pieces] | None"] = ContextVar("_known", default=None)
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class Pieces:
 
 @contextmanager
 def shared() -> Iterator[None]:
-    """Compute the cubics of a signal once for all metrics of a block, in which no signal changes."""
+    """Compute the cubics of a signal once for all metrics of a block."""
     token = _known.set({})
     try:
         yield
@@ -229,11 +229,11 @@ def _once(t: Array, f: Array) -> Pieces:
     known = _known.get()
     if known is None:
         return _cubics(t, f)
-    # Rows are new arrays each time: they are known by their memory, which lasts as long as the entry has them.
-    key = [(array.__array_interface__["data"][0], array.shape, array.strides) for array in (t, f)]
-    if (name := tuple(key)) not in known:
-        known[name] = (t, f, _cubics(t, f))
-    return known[name][2]
+    # Signals are known by their values, as a measure may use an array for one signal after the other.
+    name = t.tobytes(), f.tobytes()
+    if name not in known:
+        known[name] = _cubics(*(np.frombuffer(own) for own in name))
+    return known[name]
 
 
 def _cubics(t: Array, f: Array) -> Pieces:

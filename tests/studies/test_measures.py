@@ -320,6 +320,20 @@ def test_a_metric_of_one_comparison_is_computed_and_swept():
     np.testing.assert_allclose(swept.metrics["step"]["late"], [1 / 2, 1 / 4], rtol=1e-6)
 
 
+def test_a_measure_may_use_an_array_for_one_signal_after_the_other():
+    """The IAE of twice the error, in the memory of the error, is twice that of the error."""
+
+    def doubled(seen):
+        error = seen.error.copy()
+        once = cp.metrics.iae(seen.t, error)
+        error *= 2.0
+        return cp.metrics.iae(seen.t, error) / once
+
+    ratio = Measure("IAE of twice the error", "", "response", doubled, "ratio")
+    found = cp.compare(loop(1.0, outputs=("y",)), MOVE, T, measures=["ise", ratio])
+    assert {row["ratio"] for row in found.metrics.values()} == {2.0}
+
+
 def test_a_metric_that_a_function_returns_is_shown_by_its_name_alone():
     last = Measure("Ends", of="run", function=lambda run: {"last": run.response.outputs[0, -1]})
     found = cp.compare(loop(5.0), MOVE, T, measures={"ends": last})
