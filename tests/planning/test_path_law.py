@@ -138,6 +138,20 @@ def test_different_limits_by_axis_and_by_sign():
     assert other.duration == pytest.approx(found.duration, rel=1e-6)
 
 
+@pytest.mark.parametrize("side", ["low", "high"])
+def test_accelerations_limited_on_one_side(side):
+    """Not slower than with a limit on the other side as well."""
+    waypoints = [Waypoint(0, [0, 0], 0, 0), Waypoint(1, [1, 2]), Waypoint(2, [3, -1]), Waypoint(3, [4, 0], 0, 0)]
+    plan, sign = PolySpline(waypoints), 1.0 if side == "high" else -1.0
+    limits = {"y1_d1": 1.0, "y2_d2": cp.Limits(**{side: sign * 2.0})}
+    found = fastest(plan, limits, hold="path")
+    jet = found.plan.jet(np.linspace(found.plan.start, found.plan.end, COUNT), 2)
+    assert np.abs(jet[1, 0]).max() <= 1.0 + 1e-11
+    assert (sign * jet[2, 1]).max() <= 2.0 * (1.0 + 1e-11)
+    both = fastest(plan, limits | {"y2_d2": tuple(sorted((sign * 2.0, -sign * 40.0)))}, hold="path")
+    assert found.duration <= both.duration * 1.003
+
+
 def test_one_direction_without_velocity():
     """A limit of 0 on the side to which the plan does not move."""
     plan = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 10, 0, 0)])
@@ -293,6 +307,12 @@ def test_the_start_time_does_not_matter(start):
     assert found.margins.satisfied
 
 
+def test_nanoseconds():
+    plan = line(4).retime(1e-9)
+    found = fastest(plan, {"velocity": 1e9, "acceleration": 4e18}, hold="path")
+    assert 1.25e-9 <= found.duration <= 1.25e-9 * 1.003
+
+
 @pytest.mark.slow
 @examples(8)
 @given(size=st.floats(1e-6, 1e6), duration=st.floats(1e-6, 1e6))
@@ -335,6 +355,16 @@ def test_a_limit_in_a_part_of_the_path(start):
     assert np.abs(acceleration).max() <= 1.0 + 1e-10
     assert found.margins.satisfied
     assert found.margins.active.fraction == pytest.approx(0.0, abs=1e-9)
+
+
+def test_an_acceleration_that_is_limited_in_a_part_only():
+    """To 2 m/s in 2 s with 1 m/s^2, on for 2 s, and in 4 s to rest with 0.5 m/s^2, the limit in the second half."""
+    limits = {"y_d1": 2.0, "y_d2": [cp.Limits(-1.0, 1.0), cp.Limits(-0.5, 0.5, during=(5.0, 10.0))]}
+    found = fastest(TEN, limits, hold="path")
+    assert 8.0 <= found.duration <= 8.0 * 1.003
+    position, _, acceleration = found.plan.jet(np.linspace(found.plan.start, found.plan.end, COUNT), 2)[:, 0]
+    assert np.abs(acceleration[position > 5.0 + 1e-9]).max() <= 0.5 * (1 + 1e-10)
+    assert np.abs(acceleration).max() <= 1.0 + 1e-10
 
 
 def by_table(times):

@@ -115,11 +115,11 @@ def _shortest(part: Part, count: int) -> Array:
     powers = np.array([span.rests for span in part.spans])
     # With constant acceleration from rest the distance is the time to the power 2/(power + 1).
     found = np.where(powers > 0.0, _SHORT ** (2.0 / (np.maximum(powers, 2.0) + 1.0)), 1.0 / count)
-    with np.errstate(divide="ignore"):
-        bends = _BEND / np.maximum(np.abs(part.bends), 1e-300)
-    found[:, 1] = np.minimum(found[:, 1], bends / lengths)
-    following = np.roll(bends / np.array(part.ratios), 1)  # in the time of the next span
-    found[:, 0] = np.minimum(found[:, 0], following / lengths)
+    with np.errstate(divide="ignore", over="ignore"):
+        bends = _BEND / np.abs(part.bends)
+        found[:, 1] = np.minimum(found[:, 1], bends / lengths)
+        following = np.roll(bends / np.array(part.ratios), 1)  # in the time of the next span
+        found[:, 0] = np.minimum(found[:, 0], following / lengths)
     return 2.0 ** (0.5 * np.floor(2.0 * np.log2(np.maximum(found, _SHORT))))
 
 

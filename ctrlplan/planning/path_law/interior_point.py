@@ -113,7 +113,7 @@ class _Search:
     def minimum(self) -> Array:
         """Coefficients at the optimum."""
         x = self._start
-        w = np.maximum(self._slacks(x), _NEAREST)
+        w = np.maximum(self._slacks(x), _NEAREST * self._sizes())
         free = np.where(self._fixed, 0.0, 1.0)
         active: Array = np.concatenate([np.ones(w.size - 2 * x.size), free, free])
         # At the optimum the sum of the multipliers of normalised limits is half the duration.
@@ -157,6 +157,10 @@ class _Search:
         below = values[: len(self._lower)] - self._lower
         ends = (np.where(self._fixed, 1.0, own) for own in (x - self._floor, self._ceiling - x))
         return np.concatenate([(self._upper - values).ravel(), below.ravel(), *ends])
+
+    def _sizes(self) -> Array:
+        """Magnitudes of all limits, in the order of the slacks."""
+        return np.concatenate([self._upper.ravel(), -self._lower.ravel(), np.ones(2 * self._size)])
 
     def _changes(self, dx: Array) -> Array:
         """Changes of the slacks with coefficients."""

@@ -93,8 +93,8 @@ class Activity:
             elif bound.order == 2:
                 low, high = np.maximum(low, -_FAR * high), np.minimum(high, -_FAR * low)
                 half = 0.5 * (high - low)
-                applies = np.isfinite(half)
-                half, mean = np.where(applies, half, np.inf), np.where(applies, 0.5 * (high + low), 0.0)
+                applies = np.isfinite(half)  # otherwise infinite on both sides
+                mean = 0.5 * np.add(low, high, out=np.zeros_like(half), where=applies)
                 rows.append((first[bound.axis] / half, second[bound.axis] / half, mean / half))
             elif bound.order == 3:
                 own = np.stack([derivative[bound.axis] for derivative in (first, second, *third)])
