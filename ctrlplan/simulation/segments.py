@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from bisect import bisect_right, insort
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -46,7 +47,7 @@ _TOLERANCE = 1e-12
 """Difference of two times, relative to the run, up to which they are considered equal."""
 
 _DENOMINATOR = 10**7
-"""Maximum denominator of times that are interpreted as fractions."""
+"""Maximum denominator of times that are interpreted as fractions, relative to the power of ten above them."""
 
 _JUMP = 1e-9
 """Jump of an input of a delay, relative to its size, at whose arrival a segment ends."""
@@ -562,7 +563,9 @@ def time_tolerance(first: float, last: float) -> float:
 
 def as_fraction(seconds: float) -> Fraction:
     """Fraction with a small denominator that a number represents; otherwise its exact value."""
-    simple = Fraction(seconds).limit_denominator(_DENOMINATOR)
+    digits = -1 - math.floor(math.log10(abs(seconds))) if seconds else 0
+    unit = Fraction(10) ** max(0, digits)  # microseconds have as many digits as seconds
+    simple = (unit * Fraction(seconds)).limit_denominator(_DENOMINATOR) / unit
     return simple if abs(float(simple) - seconds) <= 1e-15 * abs(seconds) else Fraction(seconds)
 
 

@@ -152,3 +152,20 @@ def test_a_sampled_control_of_a_loop_with_a_delay(delay, offset):
             x = sum(c * cell**j for j, c in enumerate(own))
     assert (found.method, found.reason) == ("exact", "linear, with delays")
     assert np.abs(found.outputs - np.array(rows).T).max() <= 1e-14
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 1e-9])
+def test_the_unit_of_time_does_not_matter(unit):
+    """x' = h - 3 x(t - 0.15), h held from samples of 1: a sum of powers after each delay."""
+    rate = 1.0 / unit
+    moved = ct.ss(0.0, [[rate, -3.0 * rate]], 1.0, 0.0, inputs=["h", "late"], outputs="x", name="moved")
+    hold = ct.ss([], [], [], [[1.0]], 0.35 * unit, inputs="r", outputs="h", name="hold")
+    late = cp.create_delay_iosystem(0.15 * unit, inputs="x", outputs="late", name="late")
+    loop = ct.interconnect([moved, cp.sample_hold(hold, 0.35 * unit), late], inputs="r", outputs="x")
+    times = np.linspace(0.0, 1.1, 23)
+    found = cp.simulate(loop, times * unit, 1.0, [0.4, 0.0])
+    since = np.maximum(times - 0.15 * np.arange(8)[:, None], 0.0)
+    terms = [(-3.0) ** k * t**k / math.factorial(k) * (0.4 + t / (k + 1)) for k, t in enumerate(since)]
+    terms[1:] = [np.where(t > 0.0, own, 0.0) for own, t in zip(terms[1:], since[1:], strict=True)]
+    assert found.method == "exact"
+    assert np.abs(found.outputs - sum(terms)).max() <= 1e-13
