@@ -42,7 +42,7 @@ _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 NOWHERE = np.empty(0, dtype=np.intp)
 
-_known: ContextVar["dict[tuple[bytes, bytes], Pieces] | None"] = ContextVar("_known", default=None)
+_known: ContextVar["dict[tuple[bytes, bytes, tuple[int, ...]], Pieces] | None"] = ContextVar("_known", default=None)
 
 
 @dataclass(frozen=True)
@@ -230,9 +230,9 @@ def _once(t: Array, f: Array) -> Pieces:
     if known is None:
         return _cubics(t, f)
     # Signals are known by their values, as a measure may use an array for one signal after the other.
-    name = t.tobytes(), f.tobytes()
+    name = t.tobytes(), f.tobytes(), f.shape
     if name not in known:
-        known[name] = _cubics(*(np.frombuffer(own) for own in name))
+        known[name] = _cubics(np.frombuffer(name[0]), np.frombuffer(name[1]).reshape(f.shape))
     return known[name]
 
 

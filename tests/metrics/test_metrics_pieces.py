@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
 from ctrlplan import metrics
+from ctrlplan.metrics._pieces import shared
 
 UNEVEN = np.array([-1.0, -0.7, 0.1, 0.3, 0.9, 1.0, 1.8, 2.5])
 
@@ -142,3 +143,19 @@ def test_any_staircase_is_what_its_samples_say(levels, width):
     assert metrics.total_variation(t, f) == pytest.approx(np.abs(np.diff(f)).sum(), rel=1e-14)
     assert metrics.iae(t, f) == pytest.approx(trapezoid(np.abs(f), t), rel=1e-13)
     assert metrics.effort(t, f) == pytest.approx(trapezoid(f**2, t), rel=1e-13)
+
+
+@pytest.mark.parametrize("count", [2, 3, 50, 700])
+def test_metrics_that_share_cubics_are_those_alone(count):
+    """Of several rows at once, of one of them, and of an array that holds one signal after the other."""
+    t = np.linspace(0.0, 3.0, count)
+    rows = np.array([np.sin(3.0 * t), np.cos(2.0 * t) - 0.3, np.where(t > 1.0, 1.0, -0.5)])
+    functions = (metrics.ise, metrics.iae, metrics.itae, metrics.effort, metrics.total_variation)
+    alone = [function(t, own) for own in (rows, rows[0], 2.0 * rows) for function in functions]
+    held = rows.copy()
+    with shared():
+        found = [function(t, own) for own in (held, held[0]) for function in functions]
+        held *= 2.0
+        found += [function(t, held) for function in functions]
+    for one, other in zip(found, alone, strict=True):
+        np.testing.assert_array_equal(one, other)
