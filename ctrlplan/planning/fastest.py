@@ -741,8 +741,9 @@ def _span(scaled: PlansByDuration | _InLoop, duration: float, minimum: float) ->
             break
         high *= 2.0
     else:
-        if isinstance(scaled, _InLoop) and math.isinf(excess(high)):
-            scaled.limited.margins(scaled.plan(high))  # raises the reason
+        if math.isinf(excess(high)):
+            # Raises the reason. The longest durations are no use in the message about a plant.
+            scaled.limited.margins(scaled.plan(high if isinstance(scaled, _InLoop) else max(duration, minimum)))
         raise ValueError(
             f"limits must be satisfied for some duration, got none up to {high:.3g} s; for a wider search pass "
             "durations=(low, high)"
@@ -915,8 +916,15 @@ def _satisfying(
 def _reject(family: PlansByDuration | _InLoop, durations: Array, excess: Array) -> NoReturn:
     span = f"from {durations[0]:.4g} to {durations[-1]:.4g} s"
     if math.isinf(excess.min()):
-        if family.limited.loop_bounds:
-            family.limited.margins(family.plan(float(durations[-1])))  # raises the reason
+        try:
+            family.limited.margins(family.plan(float(durations[-1])))
+        except ValueError as reason:
+            if family.limited.loop_bounds:
+                raise
+            raise ValueError(
+                f"the plan must be feasible for the plant for some duration {span}, got none; "
+                f"at {durations[-1]:.4g} s: {reason}"
+            ) from reason
         raise ValueError(f"the plan must be feasible for the plant for some duration {span}, got none")
     nearest = float(durations[int(excess.argmin())])
     worst = family.limited.margins(family.plan(nearest)).active

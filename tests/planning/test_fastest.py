@@ -670,3 +670,20 @@ def test_a_limit_that_is_touched_at_rest_and_crossed_at_a_duration():
     """u = v (3 - v) is negative where the peak of v, 2.1875 d/T of a septic, exceeds 3."""
     found = cp.fastest(TURN, {"u": (0.0, 24.0)}, lambda jet: {"u": jet[1, 0] * (3.0 - jet[1, 0])})
     assert found.duration == pytest.approx(2.1875 * 6.28 / 3.0, rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("durations", "begin"), [(None, "^"), ((5.0, 9.0), "^the plan must be .*got none; at 9 s: ")])
+def test_a_plan_that_is_infeasible_for_the_plant_at_every_duration_says_why(durations, begin):
+    """Two tanks, one after the other: the level of the second one cannot fall below its outlet."""
+    pytest.importorskip("casadi")
+
+    def update(t, x, u, params):
+        first, second = np.sqrt(x[0]), np.sqrt(x[1])
+        return [u[0] - first, first - second]
+
+    tanks = ct.nlsys(update, None, states=["h1", "h2"], inputs=["q"], outputs=["h1", "h2"], name="tanks")
+    flat = cp.flat_system(tanks, "h2", at={"h2": 0.2})
+    plan = cp.PolySpline([cp.Waypoint(0, 0.2, 0, 0), cp.Waypoint(9, -0.1, 0, 0)], labels=["h2"])
+    with pytest.raises(ValueError, match=begin + "states of tanks must .* h1 is not determined by the flat outputs"):
+        cp.fastest(plan, {"q": 1.0}, flat, durations=durations)
