@@ -366,6 +366,19 @@ def fastest_under(
         limited.check_smooth(plan)
     if not _moves(plan):
         raise ValueError(f"plan must move, got constant axes: {plan!r}")
+    found = _fastest(plan, limited, hold, span, resolution, ends)
+    _check_not_vanishing(plan, found)
+    return found
+
+
+def _fastest(
+    plan: Trajectory,
+    limited: Limited,
+    hold: Hold,
+    span: tuple[float, float] | None,
+    resolution: float,
+    ends: Ends,
+) -> Fastest:
     if limited.loop_bounds:
         return _fastest_in_loop(plan, limited, hold, span, resolution)
     if hold == "waypoints":
@@ -395,6 +408,27 @@ def fastest_under(
         law = fast_law_of_signals(begun, limited).shift(plan.start)
         retimed = (_at_its_limit(law, limited) if span is None else None) or fastest_within(law, limited, span)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
+
+
+def _check_not_vanishing(plan: Trajectory, found: Fastest) -> None:
+    """Raise an error if a violation passes for rounding only because the plan is slow.
+
+    A signal with a limit of 0 that it has at rest may pass it by rounding. If it passes
+    the limit at every duration, its violation tends to 0 with its speed, and falls
+    below any rounding; at a duration that satisfies the limit, that of a slower
+    plan is far smaller.
+    """
+    row, limited = found.active, found.limited
+    slack = row.bound.slack
+    if slack - row.fraction <= 0.5 * slack:
+        return
+    longer = 1.01 * found.plan.duration
+    slower = ReplannedPlans(plan, limited).plan(longer) if found.hold == "waypoints" else found.plan.retime(longer)
+    if any(slack - other.fraction > 0.5 * slack for other in limited.margins(slower).rows if other.of(row.bound)):
+        raise ValueError(
+            "limits must be satisfied for some duration, got a violation that tends to 0 only with the speed of the "
+            f"plan: {row}; change this limit or the shape of the plan"
+        )
 
 
 def _fastest_between_stops(plan: PathPlan, limited: Limited, span: tuple[float, float] | None) -> Fastest:
@@ -707,8 +741,9 @@ def _span(scaled: PlansByDuration | _InLoop, duration: float, minimum: float) ->
             break
         high *= 2.0
     else:
-        if isinstance(scaled, _InLoop) and math.isinf(excess(high)):
-            scaled.limited.margins(scaled.plan(high))  # raises the reason
+        if math.isinf(excess(high)):
+            # Raises the reason. The longest durations are no use in the message about a plant.
+            scaled.limited.margins(scaled.plan(high if isinstance(scaled, _InLoop) else max(duration, minimum)))
         raise ValueError(
             f"limits must be satisfied for some duration, got none up to {high:.3g} s; for a wider search pass "
             "durations=(low, high)"
@@ -881,8 +916,15 @@ def _satisfying(
 def _reject(family: PlansByDuration | _InLoop, durations: Array, excess: Array) -> NoReturn:
     span = f"from {durations[0]:.4g} to {durations[-1]:.4g} s"
     if math.isinf(excess.min()):
-        if family.limited.loop_bounds:
-            family.limited.margins(family.plan(float(durations[-1])))  # raises the reason
+        try:
+            family.limited.margins(family.plan(float(durations[-1])))
+        except ValueError as reason:
+            if family.limited.loop_bounds:
+                raise
+            raise ValueError(
+                f"the plan must be feasible for the plant for some duration {span}, got none; "
+                f"at {durations[-1]:.4g} s: {reason}"
+            ) from reason
         raise ValueError(f"the plan must be feasible for the plant for some duration {span}, got none")
     nearest = float(durations[int(excess.argmin())])
     worst = family.limited.margins(family.plan(nearest)).active

@@ -4,6 +4,7 @@ import re
 from functools import cache
 from math import inf, sqrt
 
+import control as ct
 import numpy as np
 import pytest
 from hypothesis import given
@@ -643,3 +644,46 @@ def test_a_shaped_plan_says_that_its_delays_would_change():
     with pytest.raises(ValueError, match="delays of the shaper would change"):
         fastest(shaped, {"velocity": 0.8})
     assert cp.margins(shaped, {"velocity": 1.0}).satisfied
+
+
+TURN = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(2, 6.28, 0, 0, 0)])
+
+
+@pytest.mark.parametrize(
+    ("name", "system", "hold"),
+    [
+        ("u", lambda jet: {"u": jet[1, 0] + 0.05 * jet[2, 0]}, "shape"),
+        ("u", ct.tf([0.05, 1, 0], [1e-4, 0.02, 1], inputs="r", outputs="u"), "shape"),
+        ("y_d2", None, "waypoints"),
+        pytest.param("u", lambda jet: {"u": jet[2, 0]}, "path", marks=pytest.mark.slow),
+    ],
+)
+def test_a_violation_at_every_duration_is_not_rounding_of_a_slow_plan(name, system, hold):
+    """Before its end the move brakes: y'' exceeds every multiple of y' there, at any duration."""
+    with pytest.raises(
+        ValueError, match=rf"got a violation that tends to 0 only with .* plan: {name} from 0 to 24: -1"
+    ):
+        cp.fastest(TURN, {name: (0.0, 24.0)}, system, hold=hold)
+
+
+def test_a_limit_that_is_touched_at_rest_and_crossed_at_a_duration():
+    """u = v (3 - v) is negative where the peak of v, 2.1875 d/T of a septic, exceeds 3."""
+    found = cp.fastest(TURN, {"u": (0.0, 24.0)}, lambda jet: {"u": jet[1, 0] * (3.0 - jet[1, 0])})
+    assert found.duration == pytest.approx(2.1875 * 6.28 / 3.0, rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("durations", "begin"), [(None, "^"), ((5.0, 9.0), "^the plan must be .*got none; at 9 s: ")])
+def test_a_plan_that_is_infeasible_for_the_plant_at_every_duration_says_why(durations, begin):
+    """Two tanks, one after the other: the level of the second one cannot fall below its outlet."""
+    pytest.importorskip("casadi")
+
+    def update(t, x, u, params):
+        first, second = np.sqrt(x[0]), np.sqrt(x[1])
+        return [u[0] - first, first - second]
+
+    tanks = ct.nlsys(update, None, states=["h1", "h2"], inputs=["q"], outputs=["h1", "h2"], name="tanks")
+    flat = cp.flat_system(tanks, "h2", at={"h2": 0.2})
+    plan = cp.PolySpline([cp.Waypoint(0, 0.2, 0, 0), cp.Waypoint(9, -0.1, 0, 0)], labels=["h2"])
+    with pytest.raises(ValueError, match=begin + "states of tanks must .* h1 is not determined by the flat outputs"):
+        cp.fastest(plan, {"q": 1.0}, flat, durations=durations)

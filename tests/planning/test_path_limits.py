@@ -231,3 +231,16 @@ def test_limits_of_derivatives_need_no_vehicle():
         faster = cp.fastest(PLAN, limits, system, hold="path")
         assert faster.margins.satisfied
         assert faster.duration < found.duration
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"v": (0.0, 1.0)}, r"got v from 0 to 1, which allows no motion backward at x = 12, y = 0$"),
+        ({"v": cp.Limits(high=0.0), "th": 1.0}, r"got v at most 0, which allows no motion forward at x = "),
+    ],
+)
+def test_a_limit_that_forbids_a_direction_of_travel_is_named(limits, message):
+    """From 0 forward to 12, and back to 6."""
+    with pytest.raises(ValueError, match=r"^limits must allow the plan to move along its path, " + message):
+        cp.fastest(STRAIGHT, limits, FLAT, hold="path")

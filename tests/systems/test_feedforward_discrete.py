@@ -249,6 +249,19 @@ def test_its_error_and_gain_are_stated(num, den):
     assert 2.0 * np.pi < frequency < np.pi / dt
 
 
+@pytest.mark.parametrize(("zeros", "poles"), [([-0.9355], [0.9577, 0.718, 0.51]), ([-1.5, 0.9], [0.958, 0.72, 0.5])])
+def test_rounding_of_the_division_is_no_direct_influence(zeros, poles):
+    """In a companion form the division by a zero leaves 1e-16 where the influence of the input is 0."""
+    num, den = np.poly(zeros), np.poly(poles)
+    loop = ct.ss(ct.tf(num * den.sum() / num.sum(), den, 0.02), inputs="r", outputs="y", name="loop")
+    block, _, _, error = followed(loop, move(), 3.0, 0.02, method="zpetc")
+    b = np.poly(zeros[:1]) / (1.0 - zeros[0])
+    times = 0.02 * np.arange(-2, 152)
+    wanted = np.convolve(np.convolve(move()(times), b), b[::-1])[2:-2] - move()(times[1:-1])
+    assert error.max() == pytest.approx(np.abs(wanted).max(), rel=1e-6)
+    assert error.max() == pytest.approx(block.error, rel=1e-6)
+
+
 def test_slow_zeros_outside_are_pre_actuated_in_it():
     dt = 0.1
     loop = sampled(np.polymul([-1, 1], [1, 2]), [1, 6, 15, 20, 15], dt)

@@ -65,6 +65,15 @@ def test_a_regulator_returns_the_car_to_its_path():
         cp.flat_loop(CAR, PLAN, law=cp.TVLQR(Q, R))
 
 
+@pytest.mark.parametrize("speed", [-1e-14, 1e-13])
+def test_a_speed_that_rounding_leaves_at_the_end_has_no_stationary_gain(speed):
+    """x' = v cos th, y' = v sin th, th' = v tan(delta): with v = 0 the car cannot be moved sideways."""
+    end = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(6, 1, speed, 0)])
+    plan = cp.PathPlan(PLAN.segments, PLAN.directions, [law(5.0), end])
+    with pytest.raises(ValueError, match=r"final must be given for car: there is no stationary gain at the end"):
+        cp.TVLQR(Q, R).gains(CAR, plan)
+
+
 @pytest.mark.parametrize("options", [{}, {"quasi_static": True}, {"integral": True}])
 def test_a_law_that_divides_by_the_speed_is_rejected(options):
     poles = [[-1.0, -2.0, -3.0]] * 2

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -155,10 +155,25 @@ def _fastest_rates(forms: _Forms, s: Array) -> tuple[Array, Array]:
     with np.errstate(divide="ignore", invalid="ignore"):
         room = np.where(slope > 0.0, high - constant, low - constant) / slope
     matters = (np.abs(slope) > 1e-12 * size) & (np.abs(square) + np.abs(along) <= _SAME * size)
-    fastest = np.where(matters, room, np.inf).min(axis=0)
+    room = np.where(matters, room, np.inf)
+    fastest = room.min(axis=0)
+    stuck = np.flatnonzero((fastest[1:] <= 0.0) & (fastest[:-1] <= 0.0))
+    if stuck.size:  # at one point alone a signal reaches its limit at rest
+        _raise_immobile(forms, int(room[:, stuck[0]].argmin()), float(s[stuck[0]]))
     # Above 0 also where a signal reaches its limit at rest.
     fastest = np.maximum(fastest, _SAME * fastest[np.isfinite(fastest)].max(initial=0.0))
     return -fastest, fastest
+
+
+def _raise_immobile(forms: _Forms, k: int, s: float) -> NoReturn:
+    """Raise the error for a limit that allows no motion in the direction of travel."""
+    (curve,), (direction,) = forms.plan.segments, forms.plan.directions
+    where = ", ".join(f"{label} = {value:.4g}" for label, value in zip(forms.plan.labels, curve(s), strict=True))
+    bound, way = forms.limited.bounds[k], "forward" if direction > 0 else "backward"
+    raise ValueError(
+        f"limits must allow the plan to move along its path, got {bound.name} {bound.range}, which allows no motion "
+        f"{way} at {where}"
+    )
 
 
 def _differences(forms: _Forms, k: int, s: Array) -> tuple[Array, Array]:

@@ -113,14 +113,15 @@ class DiscreteCommand:
 def discrete_command(loop: ct.StateSpace, plan: Trajectory, options: PlanOptions) -> DiscreteCommand:
     """Command of a loop with a sampling time for a plan with one axis for each output."""
     check_ends(plan)
-    zeros, dt = eigenvalues(loop_inverse(loop).z), float(loop.dt)
+    inverse, dt = loop_inverse(loop), float(loop.dt)
+    zeros = eigenvalues(inverse.z)
     inverted, uncancelled = loop, zeros[:0]
     if options.method == "zpetc":
         inverted, uncancelled = _without_fast_zeros(loop, zeros)
+        inverse = loop_inverse(inverted, inverse.orders[0] + uncancelled.size)
     else:
         _check_ringing(zeros)
     reference = Reference(plan, dt, uncancelled)
-    inverse = loop_inverse(inverted)
     parts = separation(inverse.z, 1.0, _outside)
     start = equilibrium(inverted, inverse, parts, plan.initial, 1.0)
     lead = max(inverse.orders)

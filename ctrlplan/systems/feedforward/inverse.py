@@ -67,12 +67,21 @@ def first_columns(orders: Sequence[int]) -> list[int]:
     return [sum(r + 1 for r in orders[:j]) for j in range(len(orders))]
 
 
-def loop_inverse(loop: ct.StateSpace) -> Inverse:
+def loop_inverse(loop: ct.StateSpace, order: int | None = None) -> Inverse:
     """Inverse of a loop with as many inputs as outputs.
 
     If the highest derivatives depend on fewer combinations of the inputs than there
     are outputs, these combinations are replaced by their derivatives, which become
     further states, until they do.
+
+    Parameters
+    ----------
+    loop : control.StateSpace
+        The loop.
+    order : int, optional
+        Relative degree of the output of a loop with one input, where it is known.
+        Otherwise it is found from the matrices, in which an influence of the input
+        that rounding errors leave cannot be distinguished from a small one.
 
     Raises
     ------
@@ -84,7 +93,10 @@ def loop_inverse(loop: ct.StateSpace) -> Inverse:
     a, b, c = a * (scale / scale[:, None]), b / scale[:, None], c * scale
     from_states, from_inputs = np.zeros((m, n)), np.eye(m)
     while True:
-        orders, influence = _relative_degrees(a, b, c, d, names)
+        if order is None:
+            orders, influence = _relative_degrees(a, b, c, d, names)
+        else:
+            orders, influence = [order], c @ np.linalg.matrix_power(a, order - 1) @ b if order else d
         turn, count = _dependent(influence)
         if not count:
             break
