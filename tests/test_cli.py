@@ -397,6 +397,7 @@ def test_a_plan_that_fails_is_a_row_with_its_reason_beside_the_others(failing, t
     assert html.unescape(row) == found["failures"]["far <b>"] != ""
 
 
+@pytest.mark.slow
 def test_where_every_plan_fails_nothing_is_written(failing, tmp_path, capsys):
     assert failing(30.0) == 2
     *_, line = capsys.readouterr().err.splitlines()

@@ -148,8 +148,9 @@ def monte_carlo(
     collected = _Collected(drawn, results, again is not None)
 
     def identity() -> dict[str, object]:
-        own = {"kind": "monte_carlo", "loop": nominal.metrics, "units": dict(units or {})}
-        return own | {"draws": {name: digest(values) for name, values in table.items()}} | experiment.identity()
+        drawn_values = {name: digest(values) for name, values in table.items()}
+        own = {"kind": "monte_carlo", "draws": drawn_values, "loop": nominal.metrics, "units": dict(units or {})}
+        return own | experiment.identity()
 
     done = executed(runs, drawn, collected.add, execution, "draws", identity)
     done.raise_if_none_ran("the loop")

@@ -167,6 +167,7 @@ def test_flat_cost_constr(size):
     THEIRS.test_flat_cost_constr(cp.TrigFamily(size, 10, alpha=2.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [0.01, 1.0, 4.0])
 def test_flat_solve_ocp(alpha):
     THEIRS.test_flat_solve_ocp(cp.TrigFamily(9, 10, alpha=alpha))

@@ -39,6 +39,7 @@ def test_maps_of_the_package_agree_with_their_equations(flat):
     assert cp.check_flat(flat).residual < 1e-9
 
 
+@pytest.mark.slow
 def test_derived_maps_agree_with_their_equations():
     assert cp.check_flat(cp.flat_system(pvtol, huygens)).residual < 1e-8
     assert cp.check_flat(cp.flat_system(CASES["machine"].plant, ["th", "id"])).residual < 1e-8

@@ -543,6 +543,7 @@ def test_limits_of_an_angle_that_turns_are_rejected():
     assert found.active.value == pytest.approx(0.3 * math.tau, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orders", [(2, 1), (2, 2)])
 def test_optimal_control_of_python_control_on_equal_and_unequal_orders(orders):
     """The plan begins at rest, obeys the equations and costs less than to stay."""
@@ -578,6 +579,7 @@ def test_optimal_control_of_python_control_on_equal_and_unequal_orders(orders):
     np.testing.assert_allclose(slopes, rates[:, 1:-1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_flags_states_and_jets_of_wrong_sizes():
     flat = derived(CASES["crane"])
     for flag in ([np.zeros(3), np.zeros(5)], [np.zeros(5)]):

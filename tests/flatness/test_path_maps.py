@@ -136,6 +136,7 @@ def test_axes_in_another_order():
         CAR.states_and_inputs(cp.PathPlan([FORWARD], [1], law(1.0), labels=["p", "q"]), 0.0)
 
 
+@pytest.mark.slow
 def test_another_plant_rejects_the_path_and_names_the_stops():
     load = cp.PathPlan([FORWARD, BACKWARD], [1, -1], [law(5.0), law(6.0)], labels=["x", "z"])
     derived = cp.flat_system(cp.plants.Crane().iosystem(), ["x", "z"], at={"R": 10.0})

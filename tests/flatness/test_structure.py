@@ -225,6 +225,7 @@ def test_interconnections_and_their_algebraic_loops():
     np.testing.assert_allclose(u[0], 1.5 * (line(t[:10], 1) + line(t[:10])).ravel(), rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_inputs_that_are_not_controls_are_parameters():
     windy = cp.plants.Crane().iosystem(wind=True)
     flat = cp.flat_system(windy, ["x", "z"], inputs=["F", "C"], at={"R": 10.0, "wind": 0.0})

@@ -340,6 +340,7 @@ def test_alphas_none_of_which_gives_a_plan():
         cp.choose_alpha([Waypoint(0, None, 0), Waypoint(1, None, 1)])
 
 
+@pytest.mark.slow
 def test_options_reach_the_family():
     phase = cp.choose_alpha(OBSTACLE, gamma=1.0)
     assert phase.plan.gamma == (1.0, 1.0)

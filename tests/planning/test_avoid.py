@@ -183,6 +183,7 @@ def test_windows_in_two_walls():
     check(plan, avoid(plan, obstacles, clearance=0.2, load=0.3).plan, obstacles, gap=0.2, load=0.3)
 
 
+@pytest.mark.slow
 def test_many_discs():
     plan = cp.PolySpline(ACROSS)
     places = [(3, 5.5), (7, 4), (11, 6), (15, 4.5), (9, 8), (13, 1), (5, 1)]

@@ -384,6 +384,7 @@ def test_a_nonlinear_loop_starts_at_rest_and_is_simulated_over_its_tail():
     assert found["angle"].value == pytest.approx(low if low < 2.0 - high else high, abs=1e-6 * (high - low))
 
 
+@pytest.mark.slow
 def test_limits_violated_in_steady_state_or_at_the_start():
     plan = cp.PolySpline([Waypoint(0, 0.4, 0, 0), Waypoint(1, 1.4, 0, 0)])
     with pytest.raises(ValueError, match="limits must be satisfied in steady state, at any duration, got torque = "):

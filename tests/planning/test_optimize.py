@@ -595,6 +595,7 @@ def test_symmetric_data_give_symmetric_times(options):
     np.testing.assert_allclose(times + times[::-1], 4.0, rtol=1e-6)
 
 
+@pytest.mark.slow
 @examples(8)
 @given(seed=st.integers(0, 2**32 - 1), options=families)
 def test_chosen_times_are_never_worse(seed, options):

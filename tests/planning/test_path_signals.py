@@ -68,6 +68,7 @@ def test_a_crane_is_as_fast_as_by_a_nonlinear_program(plan, limits):
         assert np.abs(values[name]).max() <= limits[name] * (1 + 1e-8)
 
 
+@pytest.mark.slow
 def test_a_linear_quantity_is_a_limit_of_its_derivative():
     """A force of 3 times the acceleration: the trapezoid."""
     move = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 4, 0, 0)])

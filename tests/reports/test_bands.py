@@ -279,6 +279,7 @@ def test_results_of_a_study_hold_its_draws(drawn):
     assert study.results()["draws"] == drawn.results()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_a_metric_of_one_plan_only_is_on_the_page(tmp_path, read):
     def last(run):

@@ -155,6 +155,7 @@ def test_any_number_of_waypoints_is_named(inner):
     np.testing.assert_allclose(list(names.values()), places)
 
 
+@pytest.mark.slow
 def test_waypoints_given_in_part_are_not_marked():
     free = [MOVE[0], cp.Waypoint.from_jets(3.0, x=[math.nan, 1.0], z=[7.0, math.nan]), *MOVE[1:]]
     found = compared(MOVE, {"polynomial": cp.PolySpline(free)})
@@ -212,6 +213,7 @@ def test_plans_may_have_any_name(kind, names):
     assert any(len(axes.lines) > 0 or axes.patches for axes in drawn.axes.flat) or names[0] in ("jump", "step")
 
 
+@pytest.mark.slow
 def test_the_step_is_left_out_by_what_it_does_and_not_by_its_name():
     plans = {"step": cp.PolySpline(MOVE), "smooth": cp.Step([20.0, 11.0], [0.0, 10.0], labels=["x", "z"])}
     found = compared(MOVE, plans)
@@ -247,6 +249,7 @@ def test_a_small_crane_is_animated_as_well_as_a_large_one():
     assert data["view"][2] < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("places", one_in(2, [((0.0, 10.0), (200.0, 10.0)), ((3.0, 10.0), (3.0, 90.0))]))
 def test_the_view_is_neither_a_strip_nor_a_tower(places):
     data = json.loads(animation_data(compared(points(*places, step=60.0))))

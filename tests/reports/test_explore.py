@@ -75,6 +75,7 @@ def test_both_ends_of_a_slider_have_a_plan(key, end):
     assert np.isfinite(plan.jet(np.linspace(plan.start, plan.end, 101), 3)).all()
 
 
+@pytest.mark.slow
 def test_curves_are_those_of_the_plan_and_of_the_loop():
     """Of a first-order lag, against its closed form for a step: see the second plan of the comparison."""
     found = Exploration(MOVE, LAG)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
+from repetitions import one_in
 
 import ctrlplan as cp
 from ctrlplan.reports import (
@@ -139,9 +140,10 @@ def picture(compared, swept, craned, spread):
     return of
 
 
-@pytest.fixture(
-    scope="module", params=sorted([*SECTIONS, "two axes: plans", "two axes: responses", "trajectory", "one metric"])
-)
+KINDS = sorted([*SECTIONS, "two axes: plans", "two axes: responses", "trajectory", "one metric"])
+
+
+@pytest.fixture(scope="module", params=one_in(2, KINDS))
 def figure(request, two_axes, swept, picture):
     """Every kind of figure, on real data."""
     others = {
@@ -470,6 +472,7 @@ def test_a_comparison_draws_its_responses(compared):
     assert len(axes_of(compared.plot())) == len(axes_of(plot_responses(compared))) == 3
 
 
+@pytest.mark.slow
 def test_a_loop_without_controls_and_one_that_explodes_are_drawn_too(tmp_path):
     alone = cp.compare(cp.plants.integrator_lag_loop(5.0), MOVE, TIMES)
     assert len(axes_of(alone.plot())) == 2

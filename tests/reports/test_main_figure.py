@@ -172,6 +172,7 @@ def test_the_error_of_a_planar_plan_is_the_distance(moved):
 # The read-out
 
 
+@pytest.mark.slow
 def test_the_read_out_knows_where_each_curve_is():
     """Points of a drawn curve, taken back through the box and the scales, are those that were drawn."""
     figure = Figure(figsize=(5, 4), layout="constrained")

@@ -145,6 +145,7 @@ def test_sections_of_one_type_have_ids_of_their_own(compared, read):
     assert ids_of_figures(page)[:3] == ["it-first", "it-curves", "it-curves-2"]
 
 
+@pytest.mark.slow
 def test_a_figure_that_is_svg_already_is_put_in_as_it_is(compared, read):
     @dataclass(frozen=True)
     class Dot(Section):

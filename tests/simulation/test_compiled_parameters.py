@@ -198,6 +198,7 @@ def test_precedence_is_that_of_the_peer(levels, run, method):
     assert np.abs(found.states.ravel() - peer.states.ravel()).max() <= 1e-7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_precedence_after_a_change_is_that_of_the_peer(method):
     loop = nested(inner={"k": 2.0})

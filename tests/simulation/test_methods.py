@@ -311,6 +311,7 @@ def test_a_loop_that_appears_later_leaves_nothing_behind():
         assert np.array_equal(one.x, other.x)
 
 
+@pytest.mark.slow
 def test_threads_run_one_system_as_one_thread_does():
     def planned_loop(k):
         return ct.nlsys(

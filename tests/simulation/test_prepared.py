@@ -586,6 +586,7 @@ def test_tolerances_are_those_of_the_solver(method):
     assert errors[2] < 1e-3 * errors[0]
 
 
+@pytest.mark.slow
 def test_a_solver_that_fails_says_when():
     """x' = x^2 from 1 ends at 1 s."""
     escaping = ct.nlsys(lambda t, x, u, p: x**2, None, inputs=0, outputs="y", states=1, name="escaping")

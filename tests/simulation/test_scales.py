@@ -242,6 +242,7 @@ def rough_turns(scale, method, start=2e4, mean=100.0, ripple=1000.0, duration=2.
     return np.abs(found.outputs - expected).max(axis=1) / np.ptp(expected, axis=1), found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 7.0, 1e4], ids=["angle", "pole pairs", "turns in small units"])
 def test_positions_that_depend_on_the_sine_of_a_huge_angle(scale):
     """The tolerance relative to an angle is too large for what depends on its sine: here far below rtol = 1e-8."""

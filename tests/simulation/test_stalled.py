@@ -62,6 +62,7 @@ SLIDING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("case", SLIDING)
 def test_a_solution_that_stays_at_a_jump_names_block_and_time(case, method):

@@ -246,6 +246,7 @@ def trace_of(system, params):
     return module._agreed(block, params, module._known(block, points))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [0, 1, -1])
 def test_threads_leave_nothing_changed_and_agree(mode, numpy_mode):
     """Loops built and run in threads: the bits of one thread alone."""

@@ -217,6 +217,7 @@ def required(found):
     return {one.name: one for one in found.required_durations}
 
 
+@pytest.mark.slow
 def test_the_quintic_takes_exactly_its_own_time(stiff):
     assert required(stiff)["quintic (minimum jerk)"].duration == pytest.approx(1.0, abs=1e-12)
 
@@ -427,6 +428,7 @@ def test_a_shaper_too_slow_for_some_of_the_durations(factors):
     json.dumps(found.results(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_loop_without_controls_has_a_table_of_settling_alone():
     found = worth(loop(100.0, ("y",)), MOVE, TIMES, alpha=1.0, alphas=(1.0,), factors=(1.0,))
     assert [grid.title for grid in found.grids] == ["Settling time"]
@@ -598,6 +600,7 @@ def test_compare_hands_on_what_it_was_given():
     assert inner.metrics["quintic (minimum jerk)"]["iae"] == pytest.approx(own["iae"], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_compare_judges_the_trigonometric_plan_that_it_was_given():
     plans = {"poly": cp.PolySpline(MOVE), "mine": cp.TrigSpline(MOVE, alpha=2.5)}
     found = cp.compare(loop(100.0), plans, TIMES[::4], waypoints=MOVE)
@@ -679,6 +682,7 @@ def test_ends_that_are_not_at_rest_have_no_smoother_polynomial():
     assert smoother_polynomials([cp.Waypoint(0, 0, None, 0), cp.Waypoint(1, 1, 0, 0)]) == {}
 
 
+@pytest.mark.slow
 def test_further_baselines_are_compared_and_count():
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
     found = worth(loop(100.0), MOVE, TIMES, alpha=1.0, baselines=smoother_polynomials, **few)

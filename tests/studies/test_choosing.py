@@ -145,6 +145,7 @@ def test_one_quintic_per_segment_has_the_minimum_jerk_for_its_constraints_and_fr
 # The claim
 
 
+@pytest.mark.slow
 def test_the_claim_is_not_true_and_the_text_gives_the_values(grids):
     claim = optimality_claim(grids)
     text = " ".join(claim)
@@ -163,6 +164,7 @@ def test_the_claim_is_not_true_and_the_text_gives_the_values(grids):
     assert "nan" not in text
 
 
+@pytest.mark.slow
 def test_the_shortest_path_of_the_claim_is_the_shortest_of_a_scan(grids):
     alpha, metres = map(
         float, re.search(r"has alpha = ([\d.]+) and a length of ([\d.]+) m", optimality_claim(grids)[1]).groups()
@@ -174,6 +176,7 @@ def test_the_shortest_path_of_the_claim_is_the_shortest_of_a_scan(grids):
     assert metres == pytest.approx(min(ways), abs=0.006)
 
 
+@pytest.mark.slow
 def test_the_claim_is_counted_where_it_is_true(grids):
     """The words follow the numbers: a plan that is shorter than all baselines is counted."""
     values = grids[0].values.copy()

@@ -82,6 +82,7 @@ def test_obstacle_waypoints_are_the_papers():
     assert [w.time for w in studies.obstacle_waypoints(20.0)] == [0, 6, 11, 20]
 
 
+@pytest.mark.slow
 def test_time_with_a_slack_rope_is_measured_and_marked():
     plan = cp.Step([20, 11], [0, 10], labels=["x", "z"])
     loop = crane_loop(Crane(), plan, "setpoint", force_limits=studies.FORCE_LIMITS, torque_limits=studies.TORQUE_LIMITS)

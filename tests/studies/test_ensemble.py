@@ -123,6 +123,7 @@ def test_a_metric_that_is_infinite_in_some_draws_has_quantiles():
     assert times[3:].tolist() == [math.inf] * 2
 
 
+@pytest.mark.slow
 def test_two_parameters_are_drawn_together():
     """m x'' + c x' + k x = k r: an oscillator, with its overshoot and its response to the step."""
     drawn = cp.draws(25, seed=2, mass=stats.uniform(0.5, 1.0), damping=(0.4, 1.2))
@@ -195,6 +196,7 @@ def test_options_reach_each_draw():
     np.testing.assert_allclose(result.metrics["step"]["settling_time"], np.log(20) * np.array([0.5, 1.0]), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_waypoints_stand_for_the_standard_plans_even_from_a_generator():
     move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
     result = run(lag(), {"tau": [0.5, 1.0]}, plans=(w for w in move))
@@ -213,6 +215,7 @@ def test_waypoints_are_measured_against_as_in_a_comparison():
     assert result.nominal.waypoints == alone.waypoints
 
 
+@pytest.mark.slow
 def test_runs_that_an_event_ends_count_as_far_as_they_go():
     """The fast one stays below 0.9 no longer than tau ln 10; the slow ones to the end."""
     stop = [cp.Event("y", high=0.9, stop=True)]
@@ -230,6 +233,7 @@ def test_runs_that_an_event_ends_count_as_far_as_they_go():
     )
 
 
+@pytest.mark.slow
 def test_the_last_value_before_an_event_stands_at_no_other_time():
     stop = [cp.Event("y", high=0.9, stop=True)]
     times = np.linspace(0.0, 2.0, 21)

@@ -75,6 +75,7 @@ def test_metrics_and_bands_of_linear_draws_are_those_of_the_closed_form():
         np.testing.assert_allclose(found.bands[plan]["y"], np.quantile(curves, LEVELS, axis=0), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", [Elsewhere, lambda: ThreadPoolExecutor(2)], ids=["tasks", "threads"])
 def test_draws_of_linear_loops_are_solved_together_in_tasks(executor, solved):
     here = run(servo, DRAWS, times=FEW)

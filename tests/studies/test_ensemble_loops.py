@@ -244,6 +244,7 @@ def test_a_function_that_builds_the_loop_is_sent_in_its_place(build):
     same_bits(here, run(build, drawn, Elsewhere(), times=TIMES[::5]))
 
 
+@pytest.mark.slow
 def test_a_delay_delays_every_draw():
     result = run(lag_after_delay, {"tau": [0.5, 0.75, 1.0]}, plans={"step": cp.Step(1.0)})
     late = np.maximum(TIMES - 0.5, 0.0)
@@ -287,6 +288,7 @@ def test_all_plans_are_measured_on_the_outputs_that_a_comparison_takes():
             assert result.metrics[plan]["iae_final"][k] == pytest.approx(row["iae_final"], rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:block own .*run by control.input_output_response:UserWarning")
 def test_draws_of_a_loop_that_only_python_control_runs_do_not_mix_in_threads():
     """It keeps the parameters of a run in the system, which all threads share."""

@@ -126,6 +126,7 @@ def test_loops_are_built_once_a_plan(counted, executor):
     assert counted == {"traced": 4, "compiled": 4, "prepared": 2}
 
 
+@pytest.mark.slow
 def test_blocks_are_called_no_more_for_more_draws():
     calls = []
 
@@ -302,6 +303,7 @@ def interrupt_in_draw(monkeypatch, k):
     monkeypatch.setattr(module, "_of_forms", one)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
 def test_an_interruption_in_this_process_keeps_what_was_found(monkeypatch, found):
     interrupt_in_draw(monkeypatch, 15)

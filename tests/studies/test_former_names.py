@@ -66,6 +66,7 @@ def test_worth_is_the_benefit():
         assert cp.compare(LOOP, PLANS, TIMES, worth=False).benefit is None
 
 
+@pytest.mark.slow
 def test_worth_takes_its_choices_and_options_as_it_did():
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("half",)}
     with pytest.warns(FutureWarning):
@@ -153,6 +154,7 @@ def test_a_study_file_may_say_worth(tmp_path, capsys):
         load_study(path)
 
 
+@pytest.mark.slow
 def test_former_attributes_of_a_benefit_and_a_verdict_warn():
     found = cp.benefit(cp.compare(LOOP, MOVE, TIMES), LOOP, alphas=(1.0,), durations=(1.0,))
     grid, verdict = found.grids[0], verdicts(found.comparison)[0]

@@ -285,6 +285,7 @@ def late(seen):
     return np.abs(seen.error[:, -1])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_a_metric_is_added_by_one_entry_of_the_list(monkeypatch, tmp_path):
     """The README's recipe: a function, and an entry of MEASURES; it is then computed, saved, shown and swept."""

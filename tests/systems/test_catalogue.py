@@ -139,6 +139,7 @@ def along(expression, x, rates):
     return sum(sp.diff(expression, s) * rate for s, rate in zip(x, rates, strict=True))
 
 
+@pytest.mark.slow
 def test_neither_axle_of_the_car_slips():
     p, x, (v, delta), rates = symbolic(cp.plants.KinematicCar, wheelbase=2.5)
     px, py, theta = x
@@ -350,6 +351,7 @@ def test_parameters_of_a_simulation_are_those_of_the_maps_as_well(case):
     np.testing.assert_array_equal(flat.updfcn(0.0, x, u, {label: value}), other.iosystem().dynamics(0.0, x, u))
 
 
+@pytest.mark.slow
 def test_a_payload_that_the_law_does_not_know():
     """The parameter of the simulation is that of the plant alone: integral action removes the error that remains."""
     pytest.importorskip("casadi")

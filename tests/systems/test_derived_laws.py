@@ -103,6 +103,7 @@ def test_errors_decay_with_the_poles(make, quasi_static, poles):
         np.testing.assert_allclose(row - wanted, expected, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_number_of_poles_is_stated():
     flat = cp.flat_system(CRANE.iosystem(), ["x", "z"], at={"R": 10.0})
     with pytest.raises(ValueError, match=r"poles\[1\]") as raised:

@@ -223,6 +223,7 @@ def test_the_threshold_is_stated():
 # As a block
 
 
+@pytest.mark.slow
 def test_the_block_is_the_sum_of_its_terms():
     fit = cp.fit_feedforward(logged(gains=ALL, delay=0.0), PLAN, terms=TERMS)
     block = fit.create_iosystem()

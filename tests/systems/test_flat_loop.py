@@ -53,6 +53,7 @@ def test_a_plant_with_maps_of_its_own():
     assert np.abs(cp.simulate(limited, t).outputs["voltage"]).max() <= 3.0
 
 
+@pytest.mark.slow
 def test_feedforward_alone_follows_the_plan_from_its_start():
     loop = cp.flat_loop(CAR, LANE, law=cp.Feedforward())
     t = np.linspace(0.0, 4.0, 21)

@@ -128,6 +128,7 @@ def test_what_is_admissible_passes_unchanged(plan):
     assert found.events == []
 
 
+@pytest.mark.slow
 def test_what_is_not_admissible_waits_and_arrives():
     plan = cp.TrigSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1.0, 1.0, 0, 0)], alpha=4.0)
     found = cp.simulate(lag_loop(), np.linspace(0.0, 12.0, 2401), {"r_cmd": plan}, **TIGHT)

@@ -121,6 +121,7 @@ def loop(block):
     return ct.interconnect([block, plant], inputs=["r_cmd"], outputs=["y", "r"])
 
 
+@pytest.mark.slow
 def test_all_methods_agree():
     block = cp.create_shaper_iosystem(cp.Shaper.mzv(2.0, 0.01), DT)
     t = np.linspace(0.0, 12.0, 241)

@@ -265,6 +265,7 @@ def bang_bang(distance, v0, v1, velocity, acceleration):
     return best
 
 
+@pytest.mark.slow
 def test_trapezoids_by_cases():
     for distance, v0, v1, velocity, acceleration in trapezoid_cases(200, 6):
         plan = Trapezoid(distance, velocity=velocity, acceleration=acceleration, start_velocity=v0, end_velocity=v1)
@@ -625,6 +626,7 @@ def test_what_the_library_cannot_solve_is_an_error(monkeypatch):
         wrong(start_velocity=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time", [1e6, 1.7e9, -3e9])
 def test_late_times(time):
     """Such as seconds since 1970: limits and ends hold, and the duration is longer by no more than the rounding."""

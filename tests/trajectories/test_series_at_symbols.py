@@ -311,6 +311,7 @@ def test_a_kind_that_cannot_take_symbols_says_so(foreign):
             plan.series(casadi.SX.sym("t"), 2)
 
 
+@pytest.mark.slow
 def test_no_warning_of_our_own_at_a_symbol():
     """But for casadi's about numpy, which it shows once."""
     with warnings.catch_warnings(record=True) as seen:

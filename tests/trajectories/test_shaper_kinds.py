@@ -328,6 +328,7 @@ def shortest_on_a_grid(omega, response, tolerance, damping, count):
     return best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SPECTRA)
 @pytest.mark.parametrize(("tolerance", "damping"), [(0.05, 0.1), (0.1, 0.02)])
 def test_the_fit_is_no_longer_than_the_best_of_a_grid(name, tolerance, damping):
