@@ -120,10 +120,6 @@ class FlatMaps:
         size = np.maximum(np.abs(known), 1e-9 * np.abs(known).max(initial=1e-300))
         return np.asarray((np.abs(turned - known) <= 1e-9 * size).all(axis=0))
 
-    def flag_of(self, z: Array, p: Array) -> Array:
-        """Flags without their last entries, (nz, ...)."""
-        return self.flags(z, p)
-
     def inputs_of(self, z: Array, last: Array, p: Array) -> tuple[Array, Array]:
         """Controls of the extended plant and of the plant for the highest derivatives, (m, ...); nan for none."""
         m, trailing = self.mu.size, z.shape[1:]

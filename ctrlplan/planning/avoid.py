@@ -254,11 +254,6 @@ class _Task:
         """Clearance of the given plan."""
         return self.certificate(self.plan)
 
-    @property
-    def ngaps(self) -> int:
-        """Number of clearances, of the load and of the rope, from each obstacle."""
-        return len(self.obstacles) * (1 if self.rope is None else 2)
-
     @cached_property
     def size(self) -> float:
         """Path length of the given plan."""

@@ -114,11 +114,6 @@ class DurationSearch:
         self._exact: dict[float, tuple[Array, Array, float]] = {}
         self.evaluated, self.widest = 0, 0.0
 
-    @property
-    def exact_runs(self) -> int:
-        """Number of durations whose exact extrema were computed."""
-        return len(self._exact)
-
     def worst(self, duration: float) -> float:
         """Maximum excess at a duration, from exact extrema."""
         excess, _, others = self._excesses(duration)

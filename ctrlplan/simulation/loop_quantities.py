@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
 
 from ctrlplan._checks import check_kind, checked_finite
-from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, System
 from ctrlplan.simulation.equilibrium import linear_equilibrium
 from ctrlplan.simulation.exact_response import ExactResponse, Motion
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.loop_form import LoopForm, Rows
 from ctrlplan.simulation.loop_inputs import Fed, fed_signals, same_axis, tracked
-from ctrlplan.simulation.loop_response import LoopResponse
+from ctrlplan.simulation.loop_response import LoopResponse, LoopSignals
 from ctrlplan.simulation.plan_cells import PlanCells
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.sampled_response import SampledQuantities, has_exact_signals
@@ -24,7 +23,7 @@ from ctrlplan.simulation.simulated_response import SimulatedQuantities
 from ctrlplan.trajectories import Trajectory
 
 
-class LoopQuantities(Displayed):
+class LoopQuantities(LoopSignals):
     """Signals of a loop along a plan; returned by `loop_quantities`.
 
     Attributes
@@ -37,24 +36,16 @@ class LoopQuantities(Displayed):
         Names of its inputs in order.
     """
 
+    kind, note = "exact", "exact, at all times"
+
     def __init__(self, loop: System | Prepared) -> None:
-        self._prepared = prepared_form(loop)
+        super().__init__(prepared_form(loop))
         if self._prepared.linear is None:
             raise TypeError(
                 f"loop must be linear and continuous, got {self._prepared.name}, where {self._prepared.not_linear}"
             )
         self._linear: LinearForm = self._prepared.linear
-        self.name = self._prepared.name
-        self.inputs = tuple(self._prepared.input_labels)
-        outputs = self._prepared.output_labels
-        self.names = (*outputs, *(label for label in self._prepared.input_labels if label not in outputs))
         self._forms: dict[tuple[Fed | None, ...], LoopForm] = {}
-
-    def _describe(self) -> Iterator[Part]:
-        yield f"Signals of {self.name} along a plan: {', '.join(self.names)}"
-        yield Facts([("inputs", ", ".join(self._prepared.input_labels)), ("response", "exact")])
-
-    note = "exact, at all times"
 
     def quantities_of(self, plan: Trajectory, *, refined: bool = True) -> LoopResponse:
         """Response of the loop to a plan.

@@ -3,10 +3,50 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
+from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array
+from ctrlplan.simulation.prepared import Prepared
+
+
+def signal_names(prepared: Prepared) -> tuple[str, ...]:
+    """Names of the signals of a loop: outputs, then inputs that have other names."""
+    outputs = prepared.output_labels
+    return (*outputs, *(label for label in prepared.input_labels if label not in outputs))
+
+
+class LoopSignals(Displayed):
+    """Signals of a loop along plans; base class.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        The loop.
+
+    Attributes
+    ----------
+    name : str
+        Name of the loop.
+    names : tuple of str
+        Names of its signals: outputs, then inputs that have other names.
+    inputs : tuple of str
+        Names of its inputs in order.
+    """
+
+    kind: ClassVar[str]
+    """How responses are computed, in a word."""
+
+    def __init__(self, prepared: Prepared) -> None:
+        self._prepared, self.name = prepared, prepared.name
+        self.inputs = tuple(prepared.input_labels)
+        self.names = signal_names(prepared)
+
+    def _describe(self) -> Iterator[Part]:
+        yield f"Signals of {self.name} along a plan: {', '.join(self.names)}"
+        yield Facts([("inputs", ", ".join(self.inputs)), ("response", self.kind)])
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_lyapunov, solve_triangular
 
 from ctrlplan._checks import check_kind
-from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array
 from ctrlplan.simulation.cell_extrema import Cells, extrema_of_cells, mean_square
 from ctrlplan.simulation.equilibrium import linear_equilibrium
@@ -23,7 +22,7 @@ from ctrlplan.simulation.exact import state_scale
 from ctrlplan.simulation.flow_kernel import REACH, FlowKernel
 from ctrlplan.simulation.instants import Instants, instants_of
 from ctrlplan.simulation.loop_inputs import fed_signals, is_cyclic, tracked
-from ctrlplan.simulation.loop_response import Extremes, LoopResponse
+from ctrlplan.simulation.loop_response import Extremes, LoopResponse, LoopSignals, signal_names
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.sampled_form import SampledForm
 from ctrlplan.simulation.sampled_motion import moved_signals
@@ -56,7 +55,7 @@ _JUMP = 1e-9
 """Jump of a signal, relative to its range, above which it has no time derivative."""
 
 
-class SampledQuantities(Displayed):
+class SampledQuantities(LoopSignals):
     """Signals of a linear loop with discrete blocks along a plan; returned by `loop_quantities`.
 
     Parameters
@@ -81,19 +80,12 @@ class SampledQuantities(Displayed):
         If the loop is unstable or undamped.
     """
 
-    note = "exact, at all times"
+    kind, note = "exact", "exact, at all times"
 
     def __init__(self, prepared: Prepared, form: SampledForm) -> None:
-        self._prepared, self._form = prepared, form
-        self.name = prepared.name
-        self.inputs = tuple(prepared.input_labels)
-        outputs = prepared.output_labels
-        self.names = (*outputs, *(label for label in self.inputs if label not in outputs))
+        super().__init__(prepared)
+        self._form = form
         self._decay = _Decay(form)
-
-    def _describe(self) -> Iterator[Part]:
-        yield f"Signals of {self.name} along a plan: {', '.join(self.names)}"
-        yield Facts([("inputs", ", ".join(self.inputs)), ("response", "exact")])
 
     def quantities_of(self, plan: Trajectory, *, refined: bool = True) -> SampledResponse:
         """Response of the loop to a plan.
@@ -145,7 +137,7 @@ class SampledResponse(LoopResponse):
         check_sources(prepared, plan)
         outputs, inputs = prepared.output_labels, prepared.input_labels
         further = [k for k, label in enumerate(inputs) if label not in outputs]
-        self.names = (*outputs, *(inputs[k] for k in further))
+        self.names = signal_names(prepared)
         self._c = np.concatenate([form.c, np.zeros((len(further), form.c.shape[1]))])
         self._d = np.concatenate([form.d, np.eye(len(inputs), form.d.shape[1])[further]])
         fed = LoopInputs(plan, fed_signals(inputs, plan, prepared.name))

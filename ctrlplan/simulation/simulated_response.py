@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property, reduce
 from itertools import pairwise
 
@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from ctrlplan._checks import check_kind, checked_finite
-from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, System
 from ctrlplan.simulation.equilibrium import equilibrium_at
 from ctrlplan.simulation.loop_inputs import Fed, fed_signals, is_cyclic, same_axis, tracked
-from ctrlplan.simulation.loop_response import Extremes, LoopResponse
+from ctrlplan.simulation.loop_response import Extremes, LoopResponse, LoopSignals, signal_names
 from ctrlplan.simulation.network import Block
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.simulate import simulate
@@ -49,7 +48,7 @@ _PERIODS = (2, 4, 8, 16, 32, 64)
 """Numbers of periods of a cyclic plan, until its last two have the same mean square."""
 
 
-class SimulatedQuantities(Displayed):
+class SimulatedQuantities(LoopSignals):
     """Signals of a sampled or nonlinear loop along a plan, by simulation.
 
     Parameters
@@ -69,26 +68,20 @@ class SimulatedQuantities(Displayed):
         Names of its inputs in order.
     """
 
+    kind = "simulated"
+
     def __init__(self, loop: System | Prepared, tail: float | None = None) -> None:
-        self._prepared = prepared_form(loop)
+        super().__init__(prepared_form(loop))
         self._tail = None if tail is None else checked_finite(tail, "tail", minimum=0.0)
-        self.name = self._prepared.name
         if self._prepared.dt is True:
             raise ValueError(f"loop must have a sampling time for limits on its signals, got {self.name} with dt=True")
         _check_stable(self._prepared)
-        outputs = self._prepared.output_labels
-        self.inputs = tuple(self._prepared.input_labels)
-        self.names = (*outputs, *(label for label in self.inputs if label not in outputs))
 
     @property
     def note(self) -> str:
         """How signals are computed."""
         tail = "as long as the plan" if self._tail is None else f"of {self._tail:g} s"
         return f"simulated at tolerance {_RTOL:g}, over the move and a tail {tail}"
-
-    def _describe(self) -> Iterator[Part]:
-        yield f"Signals of {self.name} along a plan: {', '.join(self.names)}"
-        yield Facts([("inputs", ", ".join(self.inputs)), ("response", "simulated")])
 
     def quantities_of(self, plan: Trajectory, *, refined: bool = True) -> SimulatedResponse:
         """Response of the loop to a plan.
@@ -149,8 +142,7 @@ class SimulatedResponse(LoopResponse):
     def __init__(self, prepared: Prepared, plan: Trajectory, tail: float | None, refined: bool = True) -> None:
         self._prepared, self.plan, self._refined = prepared, plan, refined
         self._rtol = _RTOL if refined else _COARSE
-        outputs = prepared.output_labels
-        self.names = (*outputs, *(label for label in prepared.input_labels if label not in outputs))
+        self.names = signal_names(prepared)
         self._last = plan.end + (plan.duration if tail is None else tail)
         self.note = f"simulated at tolerance {_RTOL:g}, until {self._last - plan.end:.4g} s after the plan"
         check_sources(prepared, plan)
