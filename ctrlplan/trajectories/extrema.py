@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan.trajectories.batches import inner_extrema
 from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, points, real_roots, roots_of_rows, transform
 from ctrlplan.trajectories.common import Array, readonly
+from ctrlplan.trajectories.piecewise_extrema import Places
 
 if TYPE_CHECKING:
     from ctrlplan.trajectories.trajectory import Trajectory
@@ -119,15 +120,12 @@ def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     if nu == 0 or plan.breakpoints.size == 1:
         held = np.zeros((2, plan.naxes)) if nu else np.stack([plan.initial, plan.final])
         found.add(np.array([plan.start, plan.end]), held.T, (plan.start, plan.end))
-    if plan.in_batches:
-        _search_together(plan, nu, found)
-        return found.extrema()
-    places = plan.stationary_places(nu)
-    if places is None:
+    places = None if plan.in_batches else plan.stationary_places(nu)
+    if plan.in_batches or places is not None:
+        _search_together(plan, nu, places, found)
+    else:
         for segment in range(plan.breakpoints.size - 1):
             _search(plan, nu, segment, found)
-    else:
-        _search_places(plan, nu, *places, found)
     return found.extrema()
 
 
@@ -148,12 +146,14 @@ def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None
     found.add(times, jet(t, nu)[nu], ends)
 
 
-def _search_places(plan: Trajectory, nu: int, segments: NDArray[np.intp], s: Array, found: _Candidates) -> None:
-    """Add the ends of all segments, and candidates at times from the beginning of segments."""
+def _search_together(plan: Trajectory, nu: int, places: Places | None, found: _Candidates) -> None:
+    """Add the ends of all segments, and candidates at places in them; None: those of interpolants."""
     breakpoints, durations = plan.breakpoints, np.diff(plan.breakpoints)
     every, lengths = np.tile(np.arange(durations.size), 2), np.append(np.zeros(durations.size), durations)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), plan.segments_jet(every, lengths, nu)[nu])
+        values = plan.segments_jet(every, lengths, nu)[nu]
+        found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), values)
+        segments, s = places or inner_extrema(plan, nu, values.min(axis=1), values.max(axis=1))
         if not s.size:
             return
         slope, curve = plan.segments_jet(segments, s, nu + 2)[nu + 1 :]
@@ -164,17 +164,6 @@ def _search_places(plan: Trajectory, nu: int, segments: NDArray[np.intp], s: Arr
     s = np.concatenate([s, moved[near]])
     starts, ends = breakpoints[segments], breakpoints[segments + 1]
     found.add(np.clip(starts + s, starts, np.nextafter(ends, starts)), plan.segments_jet(segments, s, nu)[nu])
-
-
-def _search_together(plan: Trajectory, nu: int, found: _Candidates) -> None:
-    """Add candidates of all segments, which are evaluated together."""
-    breakpoints = plan.breakpoints
-    sides = [plan.jet(breakpoints[:-1], nu)[nu], plan.jet(breakpoints[1:], nu, left=True)[nu]]
-    values = np.concatenate(sides, axis=1)
-    found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), values)
-    segments, s = inner_extrema(plan, nu, values.min(axis=1), values.max(axis=1))
-    times = np.minimum(breakpoints[segments] + s, np.nextafter(breakpoints[segments + 1], -np.inf))
-    found.add(times, plan.segments_jet(segments, s, nu)[nu])
 
 
 def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: int) -> Array:
