@@ -148,9 +148,8 @@ def monte_carlo(
     collected = _Collected(drawn, results, again is not None)
 
     def identity() -> dict[str, object]:
-        drawn_values = {name: digest(values) for name, values in table.items()}
-        own = {"kind": "monte_carlo", "draws": drawn_values, "loop": nominal.metrics, "units": dict(units or {})}
-        return own | experiment.identity()
+        own = {"kind": "monte_carlo", "draws": {name: digest(values) for name, values in table.items()}}
+        return own | {"loop": nominal.metrics, "units": dict(units or {})} | experiment.identity()
 
     done = executed(runs, drawn, collected.add, execution, "draws", identity)
     done.raise_if_none_ran("the loop")

@@ -91,9 +91,9 @@ def transform(values: Array) -> Array:
 @lru_cache(maxsize=64)
 def _colleague(degree: int) -> Array:
     """Symmetric colleague matrix of the Chebyshev polynomial of a degree."""
-    beside = np.full(degree - 1, 0.5)
-    beside[:1] = np.sqrt(0.5)
-    return np.diag(beside, 1) + np.diag(beside, -1)
+    off = np.full(degree - 1, 0.5)
+    off[:1] = np.sqrt(0.5)
+    return np.diag(off, 1) + np.diag(off, -1)
 
 
 @lru_cache(maxsize=16)

@@ -147,7 +147,7 @@ def test_any_staircase_is_what_its_samples_say(levels, width):
 
 @pytest.mark.parametrize("count", [2, 3, 50, 700])
 def test_metrics_that_share_cubics_are_those_alone(count):
-    """Of several rows at once, of one of them, and of an array that holds one signal after the other."""
+    """Of several rows together, of one of them, and of an array that holds one signal after the other."""
     t = np.linspace(0.0, 3.0, count)
     rows = np.array([np.sin(3.0 * t), np.cos(2.0 * t) - 0.3, np.where(t > 1.0, 1.0, -0.5)])
     functions = (metrics.ise, metrics.iae, metrics.itae, metrics.effort, metrics.total_variation)

@@ -279,7 +279,10 @@ WRONG = {
         motor(loop={"kind": "dc-motor", "law": "feedforward"}, plans=[{"family": "step"}]),
         ["plan step must be continuous for a feedforward"],
     ),
-    "a car that stops at once": (lane(t_end=4.0), ["plan polynomial must end at rest, or at t_end = 4 s", "3 s"]),
+    "a car that stops without a deceleration": (
+        lane(t_end=4.0),
+        ["plan polynomial must end at rest, or at t_end = 4 s", "3 s"],
+    ),
     "the benefit of a car": (lane(benefit=True), ["benefit must be false for kinematic_car, got true"]),
     "a plan to the end of the run": (motor(t_end=1.0), ["t_end", "after the last waypoint"]),
     "poles for a loop": (

@@ -114,7 +114,7 @@ def test_limits_that_are_not_reached_change_nothing(name):
 
 
 def test_a_car_with_limits_of_speed_and_steering():
-    """It starts 3 m behind and 1 m beside its lane: it catches up at its highest speed, and stays in its lane."""
+    """It starts 3 m behind and 1 m off its lane: it catches up at its highest speed, and stays in its lane."""
     flat = cp.flat_system(car, ["x", "y"], at={"v": 1.0})
     ends = [(0.0, [0, 10, 0], [0, 0, 0]), (8.0, [80, 10, 0], [3.5, 0, 0])]
     plan = cp.PolySpline([cp.Waypoint.from_jets(t, x=x, y=y) for t, x, y in ends])

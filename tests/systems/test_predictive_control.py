@@ -20,7 +20,7 @@ LANE = cp.PolySpline(
 STEP, COUNT = 0.1, 8
 Q, R = np.diag([1.0, 1.0, 10.0]), np.diag([1.0, 10.0])
 OFF = np.array([0.0, 0.3, 0.0])
-"""The car starts 0.3 m beside its lane."""
+"""The car starts 0.3 m off its lane."""
 
 
 def moved(x, u):

@@ -60,7 +60,7 @@ def test_values_and_derivatives_in_many_digits(case):
     points = [Waypoint(t, *jet) for t, jet in case["points"]]
     duration, exact = points[-1].time - points[0].time, np.array(case["values"])
     size = sum(len(jet) for _, jet in case["points"])
-    tolerance = 1e-12 if size <= 24 else 1e-10  # as for many times at once
+    tolerance = 1e-12 if size <= 24 else 1e-10  # as for an array of times
     scale = np.maximum(np.abs(exact).max(axis=1), np.abs(exact[0]).max() / duration ** np.arange(4))
     for plan in [TrigSpline(points, alpha=case["alpha"], warn=False)] + (
         [] if case["alpha"] else [PolySpline(points, warn=False)]
