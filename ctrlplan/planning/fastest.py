@@ -384,10 +384,10 @@ def _fastest(
     if hold == "waypoints":
         return _searched(ReplannedPlans(plan, limited), span, hold, endless=False)
     if hold == "path":
-        smooth = limited.derivatives_only and limited.order == 3 and ends == "free"
-        if (smooth or (limited.derivatives_only and limited.order <= 2)) and not isinstance(plan, PathPlan):
+        stops = isinstance(plan, PathPlan)  # at rest at its ends as well
+        if not stops and limited.derivatives_only and limited.order <= (3 if ends == "free" else 2):
             return _fastest_on_path(plan, limited, span, ends)
-        if ends != "free" and not isinstance(plan, PathPlan):  # which is at rest at its ends
+        if not stops and ends != "free":
             raise ValueError(
                 f'ends must be "free" with limits of quantities or of derivatives of order 3 and higher, got {ends!r}'
             )
