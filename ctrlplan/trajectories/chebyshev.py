@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -10,42 +10,44 @@ from numpy.typing import NDArray
 
 from ctrlplan.trajectories.common import Array
 
-_DEGREES = (16, 32, 64, 128)
+DEGREES = (16, 32, 64, 128)
+"""Degrees of interpolants that are tried, in turn."""
 
 
 def chebyshev_proxy(
-    jet: Callable[[Array, int], Array], interval: tuple[float, float], low: int, high: int, degree: int = 0
+    jet: Callable[[Array, int], Array],
+    interval: tuple[float, float],
+    low: int,
+    high: int,
+    degrees: Sequence[int] = DEGREES,
 ) -> Array | None:
-    """Chebyshev coefficients of derivatives low to high, each from exact values, of a degree or a higher one.
+    """Chebyshev coefficients of derivatives low to high, each from exact values, of the first degree that resolves them.
 
     Returns
     -------
     ndarray, shape (high - low + 1, naxes, size), or None
-        None where degree 128 does not resolve the function.
+        None where no degree resolves the function.
     """
-    for number in (d for d in _DEGREES if d >= min(degree, _DEGREES[-1])):
-        values = jet(points(number, *interval), high)[low:]
-        coefficients = transform(values)
+    for degree in degrees:
+        coefficients = transform(jet(points(degree, *interval), high)[low:])
         used = resolved_size(coefficients)
         if used is not None:
             return coefficients[..., :used]
     return None
 
 
-def resolved_size(coefficients: Array, rtol: float = 3e-14) -> int | None:
+def resolved_size(coefficients: Array, rtol: float = 3e-14, tail: int | None = None) -> int | None:
     """Number of significant leading coefficients; None if not resolved.
 
-    A series is resolved if its last quarter lies below `rtol` of its largest
-    coefficient. That quarter is the rounding of the values, and so are all
-    coefficients of the same size.
+    A series is resolved if its last quarter, or its last `tail` coefficients, lie
+    below `rtol` of its largest coefficient. These are the rounding of the values,
+    and so are all coefficients of the same size.
     """
     size = np.abs(coefficients).reshape(-1, coefficients.shape[-1])
-    scale = size.max(axis=1, keepdims=True)
-    relative = size / np.where(scale > 0.0, scale, 1.0)
-    rounding = relative[:, -max(4, size.shape[1] // 4) :].max(axis=1, keepdims=True)
-    if rounding.max() > rtol:
+    largest, last = size.max(axis=1), size[:, -(tail or max(4, size.shape[1] // 4)) :].max(axis=1)
+    if (last > rtol * largest).any():
         return None
-    matters = np.flatnonzero((relative > 2.0 * np.maximum(rounding, 1e-16)).any(axis=0))
+    matters = (size > (2.0 * np.maximum(last, 1e-16 * largest))[:, None]).any(axis=0).nonzero()[0]
     return int(matters[-1]) + 1 if matters.size else 1
 
 
@@ -96,12 +98,12 @@ def _colleague(degree: int) -> Array:
     return np.diag(off, 1) + np.diag(off, -1)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _nodes(degree: int) -> Array:
     return np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _matrix(degree: int) -> Array:
     n = degree + 1
     matrix = (2.0 / n) * np.cos(np.pi * np.outer(np.arange(n) + 0.5, np.arange(n)) / n)

@@ -78,6 +78,9 @@ MAXIMUM_LOSS = 1e-6
 _MAXIMUM_DIGITS = 100
 """Maximum number of constraints for decimal arithmetic, which then takes a fraction of a second."""
 
+_ELEMENTARY = 3
+"""Highest order of Taylor coefficients from elementary symmetric sums."""
+
 NEARLY_CLOSED = 5.0
 """Alpha [rad] above which both ends may coincide."""
 
@@ -130,6 +133,7 @@ class NewtonSystem(Fields):
     _triangle: Array
     _spread: Array | None
     _fold: float
+    _nodes: Array
     _first: Array
     _second: Array
 
@@ -161,6 +165,7 @@ class NewtonSystem(Fields):
             order_index=orders,
             _orders=tuple(orders.tolist()),
             _fold=fold,
+            _nodes=nodes,
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
             hermite=all(g == tuple(range(len(g))) for g in given),
@@ -311,6 +316,50 @@ class NewtonSystem(Fields):
             out[self.size - 1] += self._fold * out[self.size]
         return out[: self.size]
 
+    def taylor_between(self, u: Array, order: int) -> Array:
+        r"""As `taylor`, faster at few times, none of which is a node.
+
+        A product of N factors q(u + h - x_i), or c, is its value at h = 0 times
+
+        .. math::
+            \sum_k e_k S(h)^k C(h)^{N-k}, \quad
+            S(h) = \tfrac{2}{\alpha}\sin\tfrac{\alpha h}{2}, \quad C(h) = \cos\tfrac{\alpha h}{2}
+
+        with the elementary symmetric sums e_k of the ratios f'/f of the factors,
+        which are accumulated for all functions together. Near a node a ratio is
+        large and the product small: errors are those of rounding of their product.
+
+        Returns
+        -------
+        ndarray, shape (order + 1, size, ntime)
+        """
+        half, count = 0.5 * effective(self.alpha), 2 * len(self._second)
+        if order > _ELEMENTARY:
+            return self.taylor(u, order).transpose(1, 0, 2)
+        apart = u - self._nodes[:count, None]
+        if not apart.all():
+            return self.taylor(u, order).transpose(1, 0, 2)
+        out = np.zeros((order + 1, count + 1, u.size))
+        value, sums = out[0], out[1:]
+        value[0] = 1.0
+        if half:
+            apart *= half
+            sine, cosine = np.sin(apart), np.cos(apart)
+            apart, ratio = sine / half, half * cosine / sine
+        else:
+            ratio = 1.0 / apart
+        np.multiply.accumulate(apart, axis=0, out=value[1:])
+        terms = ratio
+        for row in sums:
+            np.add.accumulate(terms, axis=0, out=row[1:])
+            terms = ratio * row[:-1]
+        if half:
+            _change_to_cosines(out, cosine[1::2], ratio[1::2], half)
+        sums *= value
+        if self._fold:
+            out[:, self.size - 1] += self._fold * out[:, self.size]
+        return out[:, : self.size]
+
     def series(self, coefficients: Array, u: Value, order: int) -> list[list[Value]]:
         """Taylor series of each axis at one normalised time, a number or a symbol."""
         factors = [
@@ -423,6 +472,40 @@ class NewtonSystem(Fields):
         exact = max(self.size - order, 1)
         nodes, weights = gauss(2 * self.size + int(4.0 * self.alpha) + 8 if self.alpha else exact)
         return (FACTORIALS[order] * np.sqrt(weights) * self.taylor(nodes, order)[:, order]).T
+
+
+def _change_to_cosines(sums: Array, cosine: Array, ratio: Array, half: float) -> None:
+    """Include the cosine of each odd function in its value and sums, and the powers of cosines in all sums.
+
+    Parameters
+    ----------
+    sums : ndarray, shape (order + 1, size, ntime)
+        Value of each product, and its elementary symmetric sums.
+    cosine, ratio : ndarray, shape (npairs, ntime)
+        Cosine of each odd function, and the ratio f'/f of the sine of the same angle.
+    half : float
+        Half of alpha [rad].
+    """
+    order, square = len(sums) - 1, half * half
+    odd = sums[:, 1::2]
+    own = -square / ratio
+    for k in range(order, 1, -1):
+        odd[k] += own * odd[k - 1]
+    if order:
+        odd[1] += own
+    odd[0] *= cosine
+    if order > 1:
+        factors = _factors(sums.shape[1])
+        sums[2] -= (0.5 * square) * factors
+        if order > 2:
+            sums[3] -= (square / 6.0) * (3.0 * factors - 2.0) * sums[1]
+
+
+@lru_cache(maxsize=256)
+def _factors(count: int) -> Array:
+    """Number of factors of each function, (count, 1)."""
+    number = np.arange(float(count))
+    return readonly((number + number % 2.0)[:, None])
 
 
 @lru_cache(maxsize=256)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy
+from ctrlplan.trajectories.chebyshev import points, resolved_size, transform
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
@@ -244,20 +244,46 @@ class NewtonSpline(WaypointSpline):
             out[:, list(axes)] = values
         return out
 
+    def _jet_between(self, s: Array, order: int) -> Array:
+        """As `_jet`, at few times between the nodes."""
+        u, scale = s / self._duration, derivative_scale(self._duration, order)[:, None, None]
+        if len(self._parts) == 1:
+            _, system, coefficients = self._parts[0]
+            return (coefficients.T @ system.taylor_between(u, order)) * scale
+        out = np.empty((order + 1, self.naxes, s.size))
+        for axes, system, coefficients in self._parts:
+            out[:, list(axes)] = coefficients.T @ system.taylor_between(u, order)
+        out *= scale
+        return out
+
     def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
-        # More terms than functions, as a trigonometric function is no polynomial.
-        degree = max(system.size for _, system, _ in self._parts) + (8 if self.alpha else 0)
+        size = max([system.size for _, system, _ in self._parts])
         interval = (0.0, float(self.breakpoints[1] - self.breakpoints[0]))
-        return chebyshev_proxy(lambda s, order: self.segment_jet(0, s, order), interval, low, high, degree)
+        if not self.alpha:  # an interpolant of the same degree is the polynomial
+            degree = size - size % 2  # an even number of points, none of them in the middle
+        else:  # more terms than functions; as the last ones decrease fast, few of them show that they suffice
+            degree = size + 11 + size % 2 + 2 * int(self.alpha * (2.0 + size / 24.0))
+        coefficients = transform(self._jet_between(points(degree, *interval), high)[low:])
+        used = resolved_size(coefficients, tail=4) if self.alpha else degree + 1
+        return super()._segment_proxy(segment, low, high) if used is None else coefficients[..., :used]
+
+    def _end_jet(self, segment: int, s: float, order: int) -> Array:
+        # What a waypoint prescribes is not computed.
+        point = self.waypoints[-1 if s and self._options.period is None else 0]
+        given = point.jet[: order + 1]
+        if len(given) > order and point.complete:
+            return given
+        found = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0]
+        found[: len(given)] = np.where(np.isnan(given), found[: len(given)], given)
+        return found
 
     def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
         """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""
+        if s == 0.0 or s == self._moments[1] - self._moments[0]:
+            ends: list[list[float]] = self._end_jet(segment, s, order).T.tolist()
+            return ends
         if not is_moderate(self._duration, order):
             return None
-        if s == 0.0 or s == self._moments[1] - self._moments[0]:
-            # At the ends, sums over the functions in their order have the prescribed zeros in every bit.
-            ends: list[list[float]] = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0].T.tolist()
-            return ends
         parts, u = self._columns, s / self._duration
         if len(parts) == 1:
             _, system, columns = parts[0]

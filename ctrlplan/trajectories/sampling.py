@@ -1,21 +1,34 @@
 """Evaluation of analytic functions at many times from exact jets at few.
 
 A Chebyshev interpolant of each derivative is built from exact jets, once for a
-segment, and evaluated by matrix products. Very many sorted times are divided into
-cells. In each cell the Taylor series about its centre, from the exact jet there,
-gives the values: by one matrix product for all cells if the times are evenly
-spaced, otherwise by one per cell. All are as accurate as the jets: series are
-truncated below rounding.
+segment. It is evaluated by matrix products, in a basis whose functions are
+products of few of them:
+
+.. math:: V_{2^k}(x) = V_{2^{k-1}}(x)^2 - 2, \qquad V_n = 2 T_n(x/2)
+
+and each function is the product of the :math:`V_{2^k}` of the binary digits of its
+number, so that one multiplication per function and time is required. By
+:math:`V_{m+n} = V_m V_n - V_{m-n}` the coefficients of one basis are sums of few
+coefficients of the other.
+
+Very many sorted times are divided into cells. In each cell the Taylor series about
+its centre, from the exact jet there, gives the values: by one matrix product for all
+cells if the times are evenly spaced, otherwise by one per cell. All are as accurate
+as the jets: series are truncated below rounding.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctrlplan.trajectories.common import FACTORIALS, Array
+from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 
 if TYPE_CHECKING:
     from ctrlplan.trajectories.trajectory import Trajectory
@@ -31,25 +44,48 @@ _SHORT = 14
 
 _MAX_TERMS = 24
 _PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
-_CHUNK = 4104  # not a power of two, to avoid cache conflicts between rows
+_CHUNK = 4104  # the functions stay in the second cache; no power of two, to avoid conflicts between rows
+_LARGEST = 2.0**20  # bound of all functions of the bases
+
+
+@dataclass(frozen=True, eq=False)
+class Interpolant:
+    """Interpolants of derivatives on one segment.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (norders * naxes, size)
+        Coefficients of the products of Chebyshev polynomials.
+    is_finite : bool
+        Whether all values on the segment are finite.
+    """
+
+    rows: Array
+    is_finite: bool
+
+    @classmethod
+    def of(cls, coefficients: Array) -> Interpolant:
+        """Interpolants from Chebyshev coefficients (norders, naxes, size)."""
+        rows = coefficients.reshape(-1, coefficients.shape[2]) @ _products_of_chebyshev(coefficients.shape[2])
+        return cls(readonly(rows), math.isfinite(_LARGEST * float(np.abs(rows).sum())))
 
 
 def sample(
     jet: Callable[[Array, int], Array],
-    proxy: Array | None,
+    interpolant: Interpolant | None,
     duration: float,
     t: Array,
     orders: tuple[int, int],
     out: Array,
-) -> None:
-    """Derivatives at many times.
+) -> bool:
+    """Derivatives at many times; whether they are certainly finite.
 
     Parameters
     ----------
     jet : callable
         Maps times (ntime,) and an order to (order + 1, naxes, ntime).
-    proxy : ndarray or None
-        Chebyshev coefficients of the derivatives, from `chebyshev_proxy`.
+    interpolant : Interpolant or None
+        Of these derivatives; None if they are not resolved.
     duration : float
         Length [s] of the segment, from 0, in which the function is analytic.
     t : ndarray, shape (ntime,)
@@ -59,20 +95,87 @@ def sample(
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
     """
-    if (proxy is None or t.size > (_CELLS if proxy.shape[2] > _SHORT else 10 * _CELLS)) and _sample_cells(
-        jet, duration, t, orders, out
-    ):
-        return
-    if proxy is None:
+    if interpolant is None or t.size > (_CELLS if interpolant.rows.shape[1] > _SHORT else 10 * _CELLS):
+        finite = _sample_cells(jet, duration, t, orders, out)
+        if finite is not None:
+            return finite
+    if interpolant is None:
         _sample_chunks(jet, t, orders, out)
-    else:
-        _sample_proxy(proxy, duration, t, out)
+        return False
+    evaluate([(interpolant.rows, 0, t.size)], t, duration, out)
+    return interpolant.is_finite
+
+
+def evaluate(parts: Iterable[tuple[Array, int, int]], t: Array, duration: Array | float, out: Array) -> None:
+    """Values of interpolants.
+
+    Parameters
+    ----------
+    parts : iterable of (ndarray, int, int)
+        Rows of an interpolant, and the first time and the one after the last at
+        which it is evaluated; increasing.
+    t : ndarray, shape (ntime,)
+        Times [s] since the start of their segments.
+    duration : float or ndarray, shape (ntime,)
+        Durations [s] of these segments.
+    out : ndarray, shape (norders, naxes, ntime)
+        Place of the result.
+    """
+    target = out.reshape(-1, t.size)  # a view
+    left = list(parts)[::-1]
+    size = max((rows.shape[1] for rows, _, _ in left), default=1)
+    basis = np.empty((max(size, 2), min(_CHUNK, t.size)))
+    basis[0] = 1.0
+    quarter = 0.25 * duration
+    for begin in range(0, t.size, _CHUNK):
+        end = min(begin + _CHUNK, t.size)
+        part = quarter if isinstance(quarter, float) else quarter[begin:end]
+        functions = basis[:, : end - begin]
+        np.subtract(t[begin:end], 2.0 * part, out=functions[1])
+        functions[1] /= part
+        _products(functions)
+        while left and left[-1][1] < end:
+            rows, first, last = left[-1]
+            step = max(1, _PRODUCT // rows.size)
+            for low in range(max(first, begin), min(last, end), step):
+                high = min(low + step, last, end)
+                np.matmul(rows, functions[: rows.shape[1], low - begin : high - begin], out=target[:, low:high])
+            if last > end:
+                break
+            left.pop()
+
+
+def _products(functions: Array) -> None:
+    """Functions (size, ntime) of the basis from the first two, 1 and V_1."""
+    top, size = 1, len(functions)
+    while 2 * top < size:
+        square = functions[2 * top]
+        np.multiply(functions[top], functions[top], out=square)
+        square -= 2.0
+        more = min(2 * top, size - 2 * top)
+        np.multiply(functions[1:more], square, out=functions[2 * top + 1 : 2 * top + more])
+        top *= 2
+
+
+@lru_cache(maxsize=256)
+def _products_of_chebyshev(size: int) -> Array:
+    """Matrix (size, size) from Chebyshev coefficients, as a row, to those of the products."""
+    found = np.zeros((size, size))  # V_n as a row, first
+    found[0, 0] = 2.0
+    top = 1
+    while top < size:
+        found[top, top] = 1.0
+        for k in range(1, min(top, size - top)):
+            found[top + k, top : 2 * top] = found[k, : size - top][:top]
+            found[top + k] -= found[top - k]
+        top *= 2
+    return readonly(0.5 * found)
 
 
 def _sample_cells(
     jet: Callable[[Array, int], Array], duration: float, t: Array, orders: tuple[int, int], out: Array
-) -> bool:
-    """Derivatives at sorted times by Taylor series in cells; False if times are not sorted, or series too long."""
+) -> bool | None:
+    """As `sample`, at sorted times by Taylor series in cells; None if times are not sorted, or series too long."""
     low, high = orders
     size = np.abs(jet(np.linspace(0.0, duration, 9), high + _MAX_TERMS + 2)).max(axis=2)
     if _is_uniform(t, duration):
@@ -80,16 +183,14 @@ def _sample_cells(
         for cell in (2048, 1024, 512, 256, 128, 64):
             terms = _taylor_terms(size, 0.5 * cell * step, low, high)
             if terms is not None:
-                _sample_uniform(jet, float(t[0]), step, cell, terms, low, out)
-                return True
+                return _sample_uniform(jet, float(t[0]), step, cell, terms, low, out)
     elif t[-1] > t[0] and bool(np.all(t[1:] >= t[:-1])):
         for cell in (4096, 2048, 1024, 512, 256):
             ncells = -(-t.size // cell)
             terms = _taylor_terms(size, 0.5 * float(t[-1] - t[0]) / ncells, low, high)
             if terms is not None:
-                _sample_sorted(jet, t, ncells, terms, low, out)
-                return True
-    return False
+                return _sample_sorted(jet, t, ncells, terms, low, out)
+    return None
 
 
 def sample_in_batches(plan: Trajectory, t: Array, low: int, high: int, left: bool) -> Array:
@@ -143,7 +244,7 @@ def _taylor_terms(size: Array, radius: float, low: int, high: int) -> int | None
 
 def _sample_uniform(
     jet: Callable[[Array, int], Array], first: float, step: float, cell: int, terms: int, low: int, out: Array
-) -> None:
+) -> bool:
     norders, naxes, count = out.shape
     ncells = count // cell
     centres = first + step * (0.5 * (cell - 1) + cell * np.arange(ncells + 1, dtype=float))
@@ -153,17 +254,20 @@ def _sample_uniform(
     scale = radius ** np.arange(terms) / FACTORIALS[:terms]
     main = ncells * cell
     block = max(1, _PRODUCT // (terms * cell))
+    size = 0.0
     for row in range(norders):
         table = np.ascontiguousarray(np.moveaxis(jets[low + row : low + row + terms], 0, -1) * scale)
+        size += float(np.abs(table).sum())
         for axis in range(naxes):
             whole = out[row, axis, :main].reshape(ncells, cell)
             for begin in range(0, ncells, block):
                 np.matmul(table[axis, begin : min(begin + block, ncells)], powers, out=whole[begin : begin + block])
             if main < count:
                 np.matmul(table[axis, ncells], powers[:, : count - main], out=out[row, axis, main:])
+    return math.isfinite(_LARGEST * size)
 
 
-def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, terms: int, low: int, out: Array) -> None:
+def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, terms: int, low: int, out: Array) -> bool:
     norders, naxes, _ = out.shape
     edges: Array = np.linspace(t[0], t[-1], ncells + 1)
     centres, radius = 0.5 * (edges[:-1] + edges[1:]), 0.5 * float(t[-1] - t[0]) / ncells
@@ -172,38 +276,28 @@ def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, te
     table = np.stack([np.moveaxis(jets[nu : nu + terms], 0, -1) for nu in range(low, low + norders)]) * scale
     table = np.moveaxis(table, 2, 0).reshape(ncells, -1, terms)
     flat = out.reshape(norders * naxes, t.size)  # a view
-    bounds = np.searchsorted(t, edges[1:-1]).tolist()
-    for k, (first, last) in enumerate(zip([0, *bounds], [*bounds, t.size], strict=True)):
-        if first < last:
-            powers = np.empty((terms, last - first))
-            powers[0] = 1.0
-            x = (t[first:last] - centres[k]) / radius
-            for n in range(1, terms):
-                np.multiply(powers[n - 1], x, out=powers[n])
-            np.matmul(table[k], powers, out=flat[:, first:last])
-
-
-def _sample_proxy(coefficients: Array, duration: float, t: Array, out: Array) -> None:
-    nrows, naxes, size = coefficients.shape
-    flat, target = coefficients.reshape(nrows * naxes, size), out.reshape(nrows * naxes, t.size)  # views
-    middle = radius = 0.5 * duration
-    part = max(1, min(_CHUNK, _PRODUCT // flat.size))
-    basis = np.empty((max(size, 2), min(_CHUNK, t.size)))
+    bounds = [0, *np.searchsorted(t, edges[1:-1]).tolist(), t.size]
+    widest = max(1, min(_CHUNK, _PRODUCT // table[0].size))
+    basis = np.empty((max(terms, 2), widest))
     basis[0] = 1.0
-    for first in range(0, t.size, _CHUNK):
-        x = (t[first : first + _CHUNK] - middle) / radius
-        terms = basis[:, : x.size]
-        terms[1] = x
-        top = 1  # T_{top + k} = 2 T_top T_k - T_{top - k}: doubles the number in each pass
-        while top < size - 1:
-            more = min(top, size - 1 - top)
-            block = terms[top + 1 : top + more + 1]
-            np.multiply(2.0 * terms[top], terms[1 : more + 1], out=block)
-            block -= terms[top - more : top][::-1]
-            top += more
-        for begin in range(0, x.size, part):
-            end = min(begin + part, x.size)
-            np.matmul(flat, terms[:size, begin:end], out=target[:, first + begin : first + end])
+    for k, (first, last) in enumerate(itertools.pairwise(bounds)):
+        for begin in range(first, last, widest):
+            end = min(begin + widest, last)
+            powers = basis[:, : end - begin]
+            np.subtract(t[begin:end], centres[k], out=powers[1])
+            powers[1] /= radius
+            _powers(powers)
+            np.matmul(table[k], powers[:terms], out=flat[:, begin:end])
+    return math.isfinite(_LARGEST * float(np.abs(table).sum()))
+
+
+def _powers(functions: Array) -> None:
+    """Powers (size, ntime) from the first two, 1 and x."""
+    top, size = 1, len(functions)
+    while top + 1 < size:  # x^(top + k) = x^top x^k doubles the number in each pass
+        more = min(top, size - 1 - top)
+        np.multiply(functions[1 : more + 1], functions[top], out=functions[top + 1 : top + more + 1])
+        top += more
 
 
 def _sample_chunks(jet: Callable[[Array, int], Array], t: Array, orders: tuple[int, int], out: Array) -> None:

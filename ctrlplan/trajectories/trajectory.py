@@ -1127,37 +1127,51 @@ class Trajectory(Displayed, Fields, ABC):
         with np.errstate(over="ignore", invalid="ignore"):
             if s.size <= _sampling.FEW or not self.naxes:
                 found = _placed(self.segment_jet(segment, s, high)[low:], out)
+                finite = False
             else:
                 found = np.empty((high - low + 1, self.naxes, s.size)) if out is None else out
-                self._sample_many(segment, s, low, found)
-            suspect = not np.isfinite(found.sum())
+                finite = self._sample_many(segment, s, low, found)
+            suspect = not finite and not np.isfinite(found.sum())
         if suspect:
             self._check_finite(found, segment, high)
         return found
 
-    def _sample_many(self, segment: int, s: Array, low: int, out: Array) -> None:
-        """Derivatives from an order on, as many as `out` has rows, at many times of a segment."""
+    def _sample_many(self, segment: int, s: Array, low: int, out: Array) -> bool:
+        """Derivatives from an order on, as many as `out` has rows, at many times of a segment.
+
+        Whether they are certainly finite is returned.
+        """
 
         def jet(u: Array, order: int) -> Array:
             return self.segment_jet(segment, u, order)
 
         high = low + len(out) - 1
-        known, key = self._proxies, (segment, low, high)
-        if key not in known:
-            known[key] = self._segment_proxy(segment, low, high)
         length = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
-        _sampling.sample(jet, known[key], length, s, (low, high), out)
+        finite = _sampling.sample(jet, self._interpolant(segment, low, high), length, s, (low, high), out)
         for k in (0, -1):  # the ends have the entries of waypoints in every bit
             end = float(s[k])
             if end in (0.0, length):
-                if (segment, end, high) not in self._end_jets:
-                    self._end_jets[segment, end, high] = jet(s[[k]], high)[:, :, 0]
-                out[:, :, k] = self._end_jets[segment, end, high][low:]
+                out[:, :, k] = self._end_jet(segment, end, high)[low:]
+        return finite
+
+    def _interpolant(self, segment: int, low: int, high: int) -> _sampling.Interpolant | None:
+        """Interpolants of derivatives low to high on a segment; None where they are not resolved."""
+        known, key = self._interpolants, (segment, low, high)
+        if key not in known:
+            proxy = self._segment_proxy(segment, low, high)
+            known[key] = None if proxy is None else _sampling.Interpolant.of(proxy)
+        return known[key]
 
     @cached_property
-    def _proxies(self) -> dict[tuple[int, int, int], Array | None]:
-        """Chebyshev coefficients of derivatives, by segment, lowest and highest order."""
+    def _interpolants(self) -> dict[tuple[int, int, int], _sampling.Interpolant | None]:
+        """Interpolants by segment, lowest and highest order."""
         return {}
+
+    def _end_jet(self, segment: int, s: float, order: int) -> Array:
+        """Jet (order + 1, naxes) at an end of a segment."""
+        if (segment, s, order) not in self._end_jets:
+            self._end_jets[segment, s, order] = self.segment_jet(segment, np.array([s]), order)[:, :, 0]
+        return self._end_jets[segment, s, order]
 
     @cached_property
     def _end_jets(self) -> dict[tuple[int, float, int], Array]:
