@@ -34,9 +34,9 @@ from ctrlplan._display import Displayed, Facts, Figure, Part, counted, number, t
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.chosen import checked_alpha
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
-from ctrlplan.trajectories.conjugate import FreeEntries
+from ctrlplan.trajectories.conjugate import FreeEntries, FreePattern
 from ctrlplan.trajectories.newton import NewtonSystem
-from ctrlplan.trajectories.piecewise import alike
+from ctrlplan.trajectories.piecewise_fit import alike
 from ctrlplan.trajectories.quadrature import gauss
 from ctrlplan.trajectories.waypoint import Entries, entry_name, waypoint_table
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
@@ -380,8 +380,8 @@ class _Segments:
         if known.all():
             return np.zeros((0, table.shape[2]))
         try:
-            free = FreeEntries(0.0, self.times, None, known, natural=True)
-            found = free.solve(table)
+            free = FreeEntries(FreePattern(0.0, known, False, natural=True), self.times)
+            found = free.solve(np.ascontiguousarray(table.T)).T
         except ValueError:  # a minimum-norm solution is found by the dense equations
             return None
         return found.astype(float)

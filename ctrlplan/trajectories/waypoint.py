@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -257,6 +258,11 @@ class Entries:
             table[np.arange(rows) < counts[:, None]] = joined
         times = readonly(np.array([point.time for point in waypoints]))
         return cls(times, readonly(table), counts, waypoints[0].labels)
+
+    @cached_property
+    def rows(self) -> Array:
+        """The entries by axis, (naxes, order + 1, nwaypoints), as used in computations."""
+        return readonly(np.ascontiguousarray(self.table.T))
 
     def scaled(self, times: Array, rate: float) -> Entries:
         """Same points at other times, with scaled derivatives.
