@@ -97,7 +97,7 @@ def kinds_of(given: NDArray[np.bool_], closed: bool) -> list[Kind]:
     """Kinds of the segments between waypoints that prescribe given entries (nwaypoints, size)."""
     count, size = given.shape
     every, last = tuple(range(size)), count if closed else count - 1
-    if closed:
+    if closed or given.all():
         return [Kind((every, every), 0, last)]
     start, end = (tuple(np.flatnonzero(given[i]).tolist()) for i in (0, count - 1))
     if not (start or end or last > 1):
@@ -156,15 +156,17 @@ class FreePattern:
         self.prescribed = [self._prescribed(kind) for kind in self.kinds]
         self.first_position = int(given[:, 0].argmax()) if given[:, 0].any() else None
 
-    def _prescribed(self, kind: Kind) -> list[int]:
-        """Entries of a kind of segments that are prescribed in some of them."""
+    def _prescribed(self, kind: Kind) -> list[tuple[int, slice]]:
+        """Entries of a kind of segments, and the segments from the first to the last in which each is prescribed."""
         given = np.concatenate([self.given, self.given[: self.closed]])
-        pairs = list(zip(kind.sides.tolist(), kind.orders.tolist(), strict=True))
-        used = [bool(given[kind.first + side : kind.last + side, k].any()) for side, k in pairs]
-        positions = [n for n, (_, k) in enumerate(pairs) if k == 0]
-        if len(positions) == 2:  # one is relative to the other
-            used[positions[1]] |= used[positions[0]]
-        return [n for n, own in enumerate(used) if own]
+        pairs = zip(kind.sides.tolist(), kind.orders.tolist(), strict=True)
+        used = [given[kind.first + side : kind.last + side, k] for side, k in pairs]
+        positions = np.flatnonzero(kind.orders == 0)
+        if positions.size == 2:  # one is relative to the other
+            used[positions[1]] = used[positions[1]] | used[positions[0]]
+            used[positions[0]] = np.zeros(kind.last - kind.first, dtype=bool)
+        found = [(n, np.flatnonzero(own)) for n, own in enumerate(used)]
+        return [(n, slice(int(own[0]), int(own[-1]) + 1)) for n, own in found if own.size]
 
     @cached_property
     def amplification(self) -> float:
@@ -322,7 +324,9 @@ class FreeEntries:
         long, orders = np.longdouble, self.pattern.orders
         offset, shifted = self._shifted(rows.astype(long))
         durations, units = np.diff(self._moments.astype(long)), self._units.astype(long)
-        every = [list(range(kind.orders.size)) for kind in self.pattern.kinds]
+        every = [
+            [(n, slice(0, kind.last - kind.first)) for n in range(kind.orders.size)] for kind in self.pattern.kinds
+        ]
         with np.errstate(all="ignore"):
             terms, scale = self._terms_of(durations, units), self._scale_of(units)
             data = self._data(shifted, scale)
@@ -414,25 +418,30 @@ class FreeEntries:
             found.append(np.asarray(weights.astype(durations.dtype, copy=False) * rows[:, :, None] * columns))
         return found
 
-    def _jumps(self, data: NDArray[Any], terms: list[NDArray[Any]], entries: Sequence[Sequence[int]]) -> NDArray[Any]:
-        """Jumps (naxes, nfree) of the conjugate derivatives; of each kind of segments only some entries are not 0."""
+    def _jumps(
+        self, data: NDArray[Any], terms: list[NDArray[Any]], entries: list[list[tuple[int, slice]]]
+    ) -> NDArray[Any]:
+        """Jumps (naxes, nfree) of the conjugate derivatives, for given entries of each kind in some segments."""
         pattern, naxes = self.pattern, len(data)
         if pattern.closed:
             data = np.concatenate([data, data[:, :, :1]], axis=2)
         jumps = np.zeros((naxes, pattern.free_orders.size, data.shape[2]), dtype=data.dtype)
         for kind, factors, used in zip(pattern.kinds, terms, entries, strict=True):
-            inside = [slice(kind.first + side, kind.last + side) for side in (0, 1)]
             # Positions relative to the start of each segment, whose functions include the constants.
             relative = np.count_nonzero(kind.orders == 0) == 2
-            for n in used:
+            for n, inside in used:
                 side, order = int(kind.sides[n]), int(kind.orders[n])
-                values = data[:, order, inside[side]]
+                left, right = kind.first + inside.start, kind.first + inside.stop
+                values = data[:, order, left + side : right + side]
                 if relative and not order:
                     if not side:
                         continue
-                    values = values - data[:, 0, inside[0]]
-                for end in (0, 1):
-                    jumps[:, :, inside[end]] += factors[end, :, n] * values[:, None]
+                    values = values - data[:, 0, left:right]
+                if not values.any():
+                    continue
+                change = factors[:, :, n, inside] * values[:, None, None]
+                jumps[:, :, left:right] += change[:, 0]
+                jumps[:, :, left + 1 : right + 1] += change[:, 1]
         if pattern.closed:
             jumps[:, :, 0] += jumps[:, :, -1]
         return np.asarray(jumps.reshape(naxes, -1).take(pattern.rows, axis=1))

@@ -169,7 +169,8 @@ class Form:
 
     def _durations(self, dtype: Any) -> NDArray[Any]:
         first, last = self.kind.first, self.kind.last
-        return np.diff(self.times[first : last + 1].astype(dtype, copy=False))
+        times = self.times[first : last + 1].astype(dtype, copy=False)
+        return np.asarray(times[1:] - times[:-1])
 
     @cached_property
     def _factors(self) -> list[NDArray[Any]]:

@@ -18,7 +18,7 @@ from ctrlplan.trajectories.chosen import checked_alpha, chosen_alpha
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.one_time import derivatives, is_moderate
-from ctrlplan.trajectories.pieces import Pieces, scales
+from ctrlplan.trajectories.pieces import Pieces, Run, scales
 from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
 from ctrlplan.trajectories.piecewise_fit import Frame
 from ctrlplan.trajectories.polynomial import PolySpline
@@ -369,16 +369,15 @@ class PiecewiseSpline(WaypointSpline):
             ends = np.full((self.naxes, 2), [np.inf, -np.inf])
             for pieces in self._pieces:
                 for run in pieces.runs:
-                    found = run.system.functions.T @ run.coefficients.reshape(run.system.size, -1)
-                    rows = found.reshape(-1, len(pieces.axes), run.last - run.first)
-                    for axis, low, high in zip(pieces.axes, rows.min(axis=(0, 2)), rows.max(axis=(0, 2)), strict=True):
-                        ends[axis] = min(ends[axis, 0], low), max(ends[axis, 1], high)
+                    low, high = _range(run, slice(None))
+                    axes = list(pieces.axes)
+                    ends[axes] = np.stack([np.minimum(ends[axes, 0], low), np.maximum(ends[axes, 1], high)], axis=1)
             remedy = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
             remedy += ", or use fit for samples"
             warn_of_swing(ends, self._entries.times, self._entries.table, self.end, self.labels, remedy)
 
     def _stays_near(self) -> bool:
-        """Whether a bound of the coefficients excludes a swing.
+        """Whether a swing is excluded: by a bound of the coefficients, by the values in segments where that fails.
 
         Of the functions of a segment the first two lead from position to position, and
         the others add a part of their ranges to it, upwards or downwards.
@@ -386,17 +385,23 @@ class PiecewiseSpline(WaypointSpline):
         if self.alpha > math.pi:
             return False
         positions = self._entries.rows[:, 0]
-        allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (positions.max(axis=1) - positions.min(axis=1))
+        lowest, highest = positions.min(axis=1), positions.max(axis=1)
+        allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (highest - lowest)
         for pieces in self._pieces:
+            axes = list(pieces.axes)
             for run in pieces.runs:
                 if not run.system.hermite:
                     return False
                 weights = np.array(run.system.ranges[1:])
-                if weights.size:
-                    sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
-                    own = (weights @ sizes).reshape(len(pieces.axes), -1).max(axis=1)
-                    if not (own <= allowed[list(pieces.axes)]).all():
-                        return False
+                if not weights.size:
+                    continue
+                sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
+                own = (weights @ sizes).reshape(len(axes), -1)
+                if (own.max(axis=1) <= allowed[axes]).all():
+                    continue
+                low, high = _range(run, np.flatnonzero(~(own <= allowed[axes, None]).all(axis=0)))
+                if not ((low >= (lowest - allowed)[axes]) & (high <= (highest + allowed)[axes])).all():
+                    return False
         return True
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
@@ -519,6 +524,14 @@ class PiecewiseSpline(WaypointSpline):
     def _facts(self) -> list[tuple[str, str]]:
         alpha = ("alpha", f"{number(self.alpha)} rad" if self.alpha else "")
         return [*super()._facts(), alpha, ("period", "" if self._period is None else f"{number(self._period)} s")]
+
+
+def _range(run: Run, segments: slice | NDArray[np.intp]) -> tuple[Array, Array]:
+    """Minimum and maximum (naxes,) in some segments of a run, on a grid."""
+    coefficients = run.coefficients[:, :, segments]
+    found = run.system.functions.T @ coefficients.reshape(run.system.size, -1)
+    values = found.reshape(-1, *coefficients.shape[1:])
+    return values.min(axis=(0, 2)), values.max(axis=(0, 2))
 
 
 def _checked_times(times: ArrayLike) -> Array:

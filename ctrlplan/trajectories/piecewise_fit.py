@@ -84,6 +84,8 @@ class Frame:
     @cached_property
     def _groups(self) -> list[_Group]:
         known = ~self.unknown
+        if known.all():
+            return [_Group(self, tuple(range(len(known))), known[0])]
         return [_Group(self, axes, known[axes[0]]) for axes in alike(known.T)]
 
 
@@ -93,11 +95,12 @@ class _Group:
     def __init__(self, frame: Frame, axes: tuple[int, ...], known: NDArray[np.bool_]) -> None:
         closed = frame.period is not None
         self.axes, self.closed = axes, closed
-        self.size = 1 + int(np.flatnonzero(known.any(axis=1)).max(initial=0))
+        self.free: FreeEntries | None = None
+        complete = known.all()
+        self.size = len(known) if complete else 1 + int(np.flatnonzero(known.any(axis=1)).max(initial=0))
         self.whole = frame.unknown.shape[:2] == (len(axes), self.size)
         given = known[: self.size].T
-        self.free: FreeEntries | None = None
-        if not given[slice(None) if closed else slice(1, -1)].all():
+        if not complete and not given[slice(None) if closed else slice(1, -1)].all():
             self.free = FreeEntries(FreePattern(frame.alpha, given, closed), frame.times, frame.period)
         kinds: list[Kind] = kinds_of(given, closed) if self.free is None else self.free.pattern.kinds
         self.forms = [Form(frame.alpha, kind, frame.breakpoints) for kind in kinds]
