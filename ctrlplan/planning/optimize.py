@@ -27,16 +27,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import blas, qr
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from ctrlplan._checks import checked_count, checked_finite, checked_labels
 from ctrlplan._display import Displayed, Facts, Figure, Part, counted, number, title_of
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.chosen import checked_alpha
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
-from ctrlplan.trajectories.conjugate import FreeEntries
+from ctrlplan.trajectories.conjugate import FreeEntries, FreePattern
 from ctrlplan.trajectories.newton import NewtonSystem
-from ctrlplan.trajectories.piecewise import alike
+from ctrlplan.trajectories.piecewise_fit import alike
 from ctrlplan.trajectories.quadrature import gauss
 from ctrlplan.trajectories.waypoint import Entries, entry_name, waypoint_table
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
@@ -44,6 +44,9 @@ from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 _EPS = float(np.finfo(float).eps)
 _LIMITED_MEMORY = {"maxcor": 30, "gtol": 1e-7, "ftol": 1e-14, "maxiter": 10_000, "maxfun": 20_000}
 """Options of the minimisation over times."""
+
+_NEAR = 0.1
+"""Relative difference of the durations below which a search that costs more has reached a known minimum."""
 
 _FEW, _NONE = 1e-6, 1e-2  # estimated relative error of the cost above which a warning, an error is raised
 
@@ -208,14 +211,15 @@ def optimize_waypoints(
         better = problem.solve((chosen - start) / duration)
         if better.cost @ factors < found.cost @ factors:
             found, times = better, chosen
-    error = _relative_error(problem, found)
+    error = _relative_error(problem, (times - start) / duration, found)
     if error > _FEW and problem.is_minimal() and problem.has_digits(np.diff(times) / duration):
         return _resolved(Entries(times, readonly(table), np.full(len(points), order + 1), names), derivative, factors)
     _check_digits(problem, error, times)
 
-    sides = np.where(np.isnan(table), found.sides / unit, table)  # prescribed entries are exact
+    # Prescribed entries are exact.
+    sides = np.where(np.isnan(table), np.stack([side.T for side in found.sides]) / unit, table)
     split, count = problem.split(), np.full(len(points), order + 1)
-    before, after = (Entries(times, readonly(side), count, names) for side in sides)
+    before, after = (Entries(readonly(times), readonly(side), count, names) for side in sides)
     plan: Trajectory
     if single or split.any():
         left, right = before.waypoints(), after.waypoints()
@@ -225,8 +229,8 @@ def optimize_waypoints(
         plan = splines[0] if single else Joined.without_shift(splines)
     else:
         plan = PiecewiseSpline.of_entries(after, alpha)
-    shared = zip(times.tolist(), np.where(split, np.nan, sides[1]), strict=True)
-    chosen_points = tuple(Waypoint.from_array(t, jet.copy(), names) for t, jet in shared)
+    shared = readonly(np.where(split, np.nan, sides[1]))
+    chosen_points = Entries(times, shared, count, names).waypoints()
     cost = float(found.cost @ factors) * duration ** (1 - 2 * derivative)
     return Optimum(chosen_points, plan, cost, found.unique, derivative)
 
@@ -242,12 +246,11 @@ def _resolved(entries: Entries, derivative: int, factors: Array) -> Optimum:
     size = entries.table.shape[1]
     jets = plan.jet(entries.times, size - 1).transpose(2, 0, 1)
     filled = np.where(np.isnan(entries.table), jets, entries.table)
-    rows = zip(entries.times.tolist(), filled, strict=True)
-    points = tuple(Waypoint.from_array(t, jet.copy(), entries.labels) for t, jet in rows)
+    points = Entries(entries.times, readonly(filled), entries.counts, entries.labels).waypoints()
     return Optimum(points, plan, float(np.sum(costs, axis=0) @ factors), True, derivative)
 
 
-def _relative_error(problem: _Problem, found: _Solution) -> float:
+def _relative_error(problem: _Problem, times: Array, found: _Solution) -> float:
     """Estimated relative error of the cost by rounding of the data."""
     position, higher = problem.table[:, 0], np.nan_to_num(problem.table[:, 1:])
     size = np.nanmax(np.abs(position), axis=0, initial=0.0)
@@ -256,7 +259,7 @@ def _relative_error(problem: _Problem, found: _Solution) -> float:
     data = ranges**2 + (higher**2).sum(axis=(0, 1))
     # A cost of 0 is attained up to rounding, relative to that of other plans through similar data.
     floor = np.maximum(found.cost, 1e-6 * data)
-    return float(np.divide(found.rounding, floor, where=data > 0.0, out=0.0 * data).max())
+    return float(np.divide(problem.rounding(times, found), floor, where=data > 0.0, out=0.0 * data).max())
 
 
 def _check_digits(problem: _Problem, error: float, times: Array) -> None:
@@ -279,30 +282,48 @@ def _check_digits(problem: _Problem, error: float, times: Array) -> None:
 class _Solution(NamedTuple):
     """Optimum at given times, in units of the duration."""
 
-    sides: Array  # entries (2, nwaypoints, order + 1, naxes): left and right of each waypoint
+    sides: tuple[Array, Array]  # entries (naxes, order + 1, nwaypoints) to the left and right of each waypoint
     cost: Array  # (naxes,)
-    slope: Array  # of the cost along the durations, shape (nsegments, naxes)
+    slope: Array  # of the cost along the durations, shape (naxes, nsegments)
     unique: bool
-    rounding: Array  # estimate of the error of the cost, shape (naxes,)
+
+
+class _Group(NamedTuple):
+    """Axes with the same prescribed entries."""
+
+    axes: NDArray[np.intp]
+    known: NDArray[np.bool_]  # (nwaypoints, order + 1)
+    rows: Array  # entries (naxes, order + 1, nwaypoints)
+    loose: NDArray[np.bool_]  # need not be continuous if free, (nwaypoints, order + 1)
+    pattern: FreePattern | None  # of equations in linear time, where these exist
 
 
 class _Problem:
     """Data of the optimisation that do not depend on the times."""
 
     def __init__(self, table: Array, continuity: int, alpha: float, derivative: int, single: bool) -> None:
-        self.table = table
+        self.table, self.rows = table, np.ascontiguousarray(table.T)
         self.family = _Whole if single else _Segments
         self.shape = (alpha, table.shape[1] - 1, derivative)
         self.loose = np.zeros(table.shape[:2], dtype=bool)  # need not be continuous if free
         self.loose[1:-1, continuity + 1 :] = not single
         known = ~np.isnan(table)
-        self.groups = [(known[:, :, axes[0]], np.array(axes)) for axes in alike(known)]
+        self.groups = [self._group(np.array(axes), known[:, :, axes[0]], self.rows) for axes in alike(known)]
+
+    def _group(self, axes: NDArray[np.intp], known: NDArray[np.bool_], rows: Array) -> _Group:
+        pattern = None
+        if self.has_conjugates() and not known.all() and not (self.loose & ~known).any():
+            pattern = FreePattern(0.0, known, False, natural=True)
+        return _Group(axes, known, rows[axes], self.loose, pattern)
+
+    def has_conjugates(self) -> bool:
+        """Whether an optimum with continuous entries is a spline of continuous conjugates."""
+        alpha, order, derivative = self.shape
+        return order == derivative - 1 and not alpha and self.family is _Segments
 
     def is_minimal(self) -> bool:
         """Whether the optimum is a spline of continuous conjugates with complete entries at both ends."""
-        alpha, order, derivative = self.shape
-        complete = order == derivative - 1 and not np.isnan(self.table[[0, -1]]).any()
-        return complete and not alpha and self.family is _Segments and not self.split().any()
+        return self.has_conjugates() and not np.isnan(self.table[[0, -1]]).any() and not self.split().any()
 
     def has_digits(self, durations: Array) -> bool:
         """Whether rounding of the positions changes no slope over a segment much, relative to that over the plan."""
@@ -315,25 +336,28 @@ class _Problem:
         """Entries that are free on each side separately, shape (nwaypoints, order + 1, naxes)."""
         return np.isnan(self.table) & self.loose[:, :, None]
 
-    def solve(self, times: Array) -> _Solution:
-        """Minimum cost at relative times."""
+    def solve(self, times: Array, estimate: bool = False) -> _Solution:
+        """Minimum cost at relative times; an estimate for a search has about nine digits."""
         family = self.family(times, *self.shape)
-        count, _, naxes = self.table.shape
-        sides, cost, slope = np.empty((2, *self.table.shape)), np.empty(naxes), np.empty((count - 1, naxes))
-        unique, rounding = True, np.empty(naxes)
-        for known, axes in self.groups:
-            part = family.solve(known, self.table[:, :, axes], self.loose)
-            sides[..., axes], cost[axes], slope[:, axes] = part.sides, part.cost, part.slope
-            rounding[axes] = part.rounding
-            unique &= part.unique
-        return _Solution(sides, cost, slope, unique, rounding)
+        found = [family.solve(group, estimate) for group in self.groups]
+        if len(found) == 1:
+            return found[0]
+        naxes, _, count = self.rows.shape
+        sides, cost, slope = np.empty((2, *self.rows.shape)), np.empty(naxes), np.empty((naxes, count - 1))
+        for group, part in zip(self.groups, found, strict=True):
+            sides[:, group.axes], cost[group.axes], slope[group.axes] = part.sides, part.cost, part.slope
+        return _Solution((sides[0], sides[1]), cost, slope, all(part.unique for part in found))
+
+    def rounding(self, times: Array, found: _Solution) -> Array:
+        """Estimate (naxes,) of the error of the cost."""
+        return self.family(times, *self.shape).rounding(found)
 
     def scale(self, times: Array) -> Array:
         """Cost (naxes,) of entries of these magnitudes without cancellation: free ones 0, alternating signs."""
-        known = np.ones(self.table.shape[:2], dtype=bool)
-        entries = np.abs(np.nan_to_num(self.table))
-        entries[1::2] *= -1.0
-        return self.family(times, *self.shape).solve(known, entries, self.loose).cost
+        entries = np.abs(np.nan_to_num(self.rows))
+        entries[:, :, 1::2] *= -1.0
+        group = self._group(np.arange(len(entries)), np.ones(self.table.shape[:2], dtype=bool), entries)
+        return self.family(times, *self.shape).solve(group).cost
 
 
 class _Segments:
@@ -343,58 +367,70 @@ class _Segments:
         self.root = _segment_root(alpha, order, derivative)
         self.derivative = derivative
         self.times = times
-        self.minimal = not alpha and order == derivative - 1  # then the optimum is a spline of continuous conjugates
-        self.durations = np.diff(times)[:, None]
+        self.durations = times[1:] - times[:-1]
         self.orders = np.tile(np.arange(order + 1), 2)
+        powers = [np.ones_like(self.durations)]
+        while len(powers) <= order:
+            powers.append(powers[-1] * self.durations)
+        self.powers = np.concatenate([powers, powers])  # (nentries, nsegments)
 
-    def solve(self, known: NDArray[np.bool_], table: Array, loose: NDArray[np.bool_]) -> _Solution:
+    def solve(self, group: _Group, estimate: bool = False) -> _Solution:
         """Optimum of axes with the same pattern of prescribed entries."""
+        filled = self._banded(group, estimate)
+        left, right, unique = self._dense(group) if filled is None else (filled, filled, True)
+        data = self._data(left, right)
+        value, change = self.root @ data, self.root @ (data * self.orders[:, None])
+        power = 1 - 2 * self.derivative
+        square, both = (value * value).sum(axis=1), (value * change).sum(axis=1)
+        weight = self.durations**power
+        slope = (weight / self.durations) * (power * square + 2.0 * both)
+        return _Solution((left, right), square @ weight, slope, unique)
+
+    def rounding(self, found: _Solution) -> Array:
+        """Estimate (naxes,) of the error of the cost."""
+        data = self._data(*found.sides)
+        errors = _rounding(self.root @ data, np.abs(self.root) @ np.abs(data)).sum(axis=1)
+        ofcost = errors @ self.durations ** (1 - 2 * self.derivative)
+        return np.asarray(ofcost + 16.0 * _EPS * np.abs(found.slope).sum(axis=1))  # of the times
+
+    def _data(self, left: Array, right: Array) -> Array:
+        """Entries (naxes, nentries, nsegments) of both ends of each segment in relative time."""
+        return np.concatenate([right[:, :, :-1], left[:, :, 1:]], axis=1) * self.powers
+
+    def _banded(self, group: _Group, estimate: bool) -> Array | None:
+        """All entries in linear time; None where the free ones are not unique."""
+        if group.known.all():
+            return group.rows
+        if group.pattern is None:
+            return None
+        free = FreeEntries(group.pattern, self.times)
+        try:
+            found = free.estimate(group.rows) if estimate else free.solve(group.rows)
+        except ValueError:  # a minimum-norm solution is found by the dense equations
+            return None
+        filled = group.rows.copy()
+        filled.reshape(len(filled), -1)[:, group.pattern.places] = found
+        return filled
+
+    def _dense(self, group: _Group) -> tuple[Array, Array, bool]:
+        """Entries to the left and to the right of all waypoints by least squares, and whether they are unique."""
+        known = group.known
         # Columns of the entries to the right of each waypoint; those to the left are the same, or additional ones.
         right = np.arange(known.size).reshape(known.shape)
         left = right.copy()
-        apart = loose & ~known
+        apart = group.loose & ~known
         left[apart] = known.size + np.arange(apart.sum())
         fixed = np.append(known, np.zeros(apart.sum(), dtype=bool))
-        entries = np.zeros((fixed.size, table.shape[2]))
-        entries[fixed] = table[known]
+        entries = np.zeros((fixed.size, len(group.rows)))
+        entries[fixed] = group.rows.T[known]
 
-        powers = self.durations**self.orders
         ends = np.concatenate([right[:-1], left[1:]], axis=1)
-        found = self._banded(known, table) if self.minimal and not apart.any() else None
-        if found is not None:
-            entries[~fixed], unique = found, True
-        else:
-            entries[~fixed], unique = self._dense(entries, fixed, ends, powers)
-
-        data = entries[ends] * powers[:, :, None]
-        value, change = self.root @ data, self.root @ (data * self.orders[:, None])
-        power = 1 - 2 * self.derivative
-        square = (value**2).sum(axis=1)
-        slope = self.durations ** (power - 1) * (power * square + 2.0 * (value * change).sum(axis=1))
-        rounding = (self.durations**power * _rounding(value, np.abs(self.root) @ np.abs(data)).sum(axis=1)).sum(axis=0)
-        rounding += 16.0 * _EPS * np.abs(slope).sum(axis=0)  # of the times
-        return _Solution(entries[[left, right]], (self.durations**power * square).sum(axis=0), slope, unique, rounding)
-
-    def _banded(self, known: NDArray[np.bool_], table: Array) -> Array | None:
-        """Free entries in linear time; None where they are not unique."""
-        if known.all():
-            return np.zeros((0, table.shape[2]))
-        try:
-            free = FreeEntries(0.0, self.times, None, known, natural=True)
-            found = free.solve(table)
-        except ValueError:  # a minimum-norm solution is found by the dense equations
-            return None
-        return found.astype(float)
-
-    def _dense(
-        self, entries: Array, fixed: NDArray[np.bool_], ends: NDArray[np.intp], powers: Array
-    ) -> tuple[Array, bool]:
-        """Free entries by least squares, and whether they are unique."""
         samples = np.zeros((len(ends), len(self.root), fixed.size))
-        np.put_along_axis(samples, ends[:, None, :], self.root * powers[:, None, :], axis=2)
+        np.put_along_axis(samples, ends[:, None, :], self.root * self.powers.T[:, None, :], axis=2)
         matrix = samples.reshape(-1, fixed.size)
-        weight = np.repeat(self.durations.ravel() ** (0.5 - self.derivative), len(self.root))
-        return _least_squares(matrix[:, ~fixed], -matrix @ entries, weight)
+        weight = np.repeat(self.durations ** (0.5 - self.derivative), len(self.root))
+        entries[~fixed], unique = _least_squares(matrix[:, ~fixed], -matrix @ entries, weight)
+        return entries[left].T, entries[right].T, unique
 
 
 class _Whole:
@@ -412,11 +448,11 @@ class _Whole:
             turned = NewtonSystem(alpha, times, given, self.system.gamma + 0.25 * np.pi / m)
             self.turn = 2.0 * alpha * m / times.size * (turned.squared_samples(derivative) - self.samples)[:, -1]
 
-    def solve(self, known: NDArray[np.bool_], table: Array, loose: NDArray[np.bool_]) -> _Solution:
+    def solve(self, group: _Group, estimate: bool = False) -> _Solution:
         """Optimum of axes with the same pattern of prescribed entries."""
-        fixed = known.ravel()
+        fixed, table = group.known.ravel(), group.rows.T
         entries = np.nan_to_num(table).reshape(fixed.size, -1)
-        matrix = self.samples @ _fitted(self.system, np.eye(fixed.size))
+        matrix = self._matrix()
         right = -self.samples @ _fitted(self.system, entries)
         entries[~fixed], unique = _least_squares(matrix[:, ~fixed], right, np.ones(len(matrix)))
 
@@ -425,17 +461,26 @@ class _Whole:
         # Sensitivity to a prescribed entry. When a waypoint moves in time, its entries are constant, and differ from
         # those of the plan by Taylor's theorem.
         scale = _norms(self.samples)
-        basis, upper = np.linalg.qr((self.jets[:, :-1][known] / scale).T)
+        basis, upper = np.linalg.qr((self.jets[:, :-1][group.known] / scale).T)
         price = np.zeros_like(table)
-        price[known] = blas.dtrsm(1.0, upper, basis.T @ (self.samples.T @ value / scale[:, None]))
+        price[group.known] = blas.dtrsm(1.0, upper, basis.T @ (self.samples.T @ value / scale[:, None]))
         slope = -2.0 * (price * (self.jets[:, 1:] @ coefficients)).sum(axis=1)
         if self.turn is not None:  # the mean moves as well, and with it gamma
             slope += (self.turn @ value) * coefficients[-1]
         slope[-1] = 0.0  # the last time is fixed
-        side = entries.reshape(table.shape)
+        side = entries.reshape(table.shape).T
         along = np.cumsum(slope[:0:-1], axis=0)[::-1]
-        rounding = _rounding(value, np.abs(matrix) @ np.abs(entries)).sum(axis=0)
-        return _Solution(np.stack([side, side]), (value**2).sum(axis=0), along, unique, rounding)
+        return _Solution((side, side), (value**2).sum(axis=0), along.T, unique)
+
+    def rounding(self, found: _Solution) -> Array:
+        """Estimate (naxes,) of the error of the cost."""
+        entries = found.sides[1].T.reshape(self.system.size, -1)
+        value = self.samples @ _fitted(self.system, entries)
+        return np.asarray(_rounding(value, np.abs(self._matrix()) @ np.abs(entries)).sum(axis=0))
+
+    def _matrix(self) -> Array:
+        """Samples by the entries of all waypoints."""
+        return np.asarray(self.samples @ _fitted(self.system, np.eye(self.system.size)))
 
 
 @lru_cache(maxsize=256)
@@ -499,29 +544,36 @@ def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Arra
     segments = np.diff(given)
     minimum = min(1e-4 / segments.size, 0.5 * float(segments.min()))
     room = 1.0 - segments.size * minimum
-    chord = np.sqrt(np.diff(first.sides[1, :, 0], axis=0) ** 2 @ weights)
+    chord = np.sqrt(weights @ np.diff(first.sides[1][:, 0]) ** 2)
     chord = chord / chord.max() if chord.any() else np.ones(segments.size)
+    best: list[tuple[float, Array]] = []  # cost and logarithms of the durations of minima
 
-    def durations(x: Array) -> tuple[Array, Array]:
-        share = np.exp(x - x.max())
-        share /= share.sum()
-        return minimum + room * share, share
+    def shares(x: Array) -> Array:
+        share: Array = np.exp(x - x.max())
+        return share / share.sum()
 
     def objective(x: Array) -> tuple[float, Array]:
-        h, share = durations(x)
-        found = problem.solve(_times(h))
-        cost, slope = float(found.cost @ weights) + floor, room * share * (found.slope @ weights)
+        share = shares(x)
+        found = problem.solve(_times(minimum + room * share), estimate=True)
+        cost, slope = float(found.cost @ weights) + floor, room * share * (weights @ found.slope)
         return math.log(cost), (slope - share * slope.sum()) / cost
 
-    def best_from(start: Array) -> tuple[float, Array]:
-        h = np.maximum(start / start.sum(), 2.0 * minimum)
-        x = np.log(h / h.sum() - minimum)
-        # Without a matrix of the size of the problem, whose products in threads would take most of the time.
-        result = minimize(objective, x, jac=True, method="L-BFGS-B", options=_LIMITED_MEMORY)
-        return float(result.fun), _times(durations(result.x)[0])
+    def stop_near_known(intermediate_result: OptimizeResult) -> None:
+        """End the search where it leads to a minimum that is known."""
+        logarithms = np.log(shares(intermediate_result.x))
+        for cost, known in best:
+            if intermediate_result.fun >= cost and np.abs(logarithms - known).max() < _NEAR:
+                raise StopIteration
 
     starts = [segments, *(chord**power for power in (1.0, 0.5, 1.0 / 3.0, 0.0))]
-    return min(map(best_from, starts), key=lambda pair: pair[0])[1]
+    shorts = [np.maximum(start / start.sum(), 2.0 * minimum) for start in starts]
+    logs = [np.log(h / h.sum() - minimum) for h in shorts]
+    for x in sorted(logs, key=lambda x: objective(x)[0]):
+        # Without a matrix of the size of the problem, whose products in threads would take most of the time.
+        result = minimize(objective, x, jac=True, method="L-BFGS-B", callback=stop_near_known, options=_LIMITED_MEMORY)
+        best.append((float(result.fun), np.log(shares(result.x))))
+    chosen = min(best, key=lambda pair: pair[0])[1]
+    return _times(minimum + room * np.exp(chosen))
 
 
 def _times(durations: Array) -> Array:

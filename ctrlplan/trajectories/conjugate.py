@@ -9,7 +9,6 @@ precision, or the equations are solved in decimal arithmetic.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from ctrlplan.trajectories.common import FACTORIALS, Array
+from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.conjugate_digits import Ends, conjugate_digits
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 
@@ -98,7 +97,7 @@ def kinds_of(given: NDArray[np.bool_], closed: bool) -> list[Kind]:
     """Kinds of the segments between waypoints that prescribe given entries (nwaypoints, size)."""
     count, size = given.shape
     every, last = tuple(range(size)), count if closed else count - 1
-    if closed:
+    if closed or given.all():
         return [Kind((every, every), 0, last)]
     start, end = (tuple(np.flatnonzero(given[i]).tolist()) for i in (0, count - 1))
     if not (start or end or last > 1):
@@ -111,82 +110,193 @@ def kinds_of(given: NDArray[np.bool_], closed: bool) -> list[Kind]:
     return [part for part in parts if part.first < part.last]
 
 
-class FreeEntries:
-    """Equations of the free entries of inner waypoints, for one pattern of prescribed entries.
+class FreePattern:
+    """Free entries of waypoints and the places of their equations: all that does not depend on times.
+
+    Arrays by entry have the shape (naxes, size, nwaypoints), unknowns the shape (naxes, nfree).
 
     Parameters
     ----------
     alpha : float
         Shape parameter [rad] of each segment; 0 gives polynomials.
-    times : ndarray, shape (nwaypoints,)
-        Times of the waypoints [s].
-    period : float or None
-        Period of a closed plan, whose last segment leads back to the first
-        waypoint.
     given : ndarray of bool, shape (nwaypoints, size)
         Prescribed entries by order.
+    closed : bool
+        Whether a last segment leads back to the first waypoint.
     natural : bool, optional
         Whether the free entries of both ends are unknown as well, with conjugate
         derivatives of 0; otherwise they lower the degree of the first and last
         segment.
+
+    Attributes
+    ----------
+    nodes, orders : ndarray of int, shape (nfree,)
+        Waypoint and order of each unknown, in the order of the equations.
     """
 
-    def __init__(
-        self,
-        alpha: float,
-        times: Array,
-        period: float | None,
-        given: NDArray[np.bool_],
-        natural: bool = False,
-    ) -> None:
-        self._alpha, self._times, self._period, self._given = alpha, times, period, given
-        self._open = period is None and not natural
-        self._moments = np.append(times, [] if period is None else times[0] + period)
-        self._count, self._size = given.shape
-        self.kinds = kinds_of(np.ones_like(given) if natural else given, period is not None)
+    def __init__(self, alpha: float, given: NDArray[np.bool_], closed: bool, natural: bool = False) -> None:
+        self.alpha, self.given, self.closed = alpha, given, closed
+        self.open = not closed and not natural
+        self.count, self.size = given.shape
+        self.kinds = kinds_of(np.ones_like(given) if natural else given, closed)
         free = ~given
-        if self._open:
+        if self.open:
             free[[0, -1]] = False
-        self._number = np.full(given.shape, -1, dtype=np.intp)  # of each unknown, in the order of the equations
-        rank = np.argsort(_folded(self._count)) if period is not None else np.arange(self._count)
+        rank = np.argsort(_folded(self.count)) if closed else np.arange(self.count)
         ordered = np.argsort(rank, kind="stable")
         nodes, self.orders = np.nonzero(free[ordered])
         self.nodes = ordered[nodes]
-        self._number[self.nodes, self.orders] = np.arange(self.nodes.size)
-        self._free_orders = np.flatnonzero(free.any(axis=0))
-        self._row = np.searchsorted(self._free_orders, self.orders)
-        self._durations = np.diff(self._moments)
-        before = np.append(np.inf, self._durations) if period is None else np.roll(self._durations, 1)
-        self._units = np.minimum(before, np.append(self._durations, [np.inf] * (period is None)))
+        self.free_orders = np.flatnonzero(free.any(axis=0))
+        self.mask = np.ascontiguousarray(given.T)
+        self.conjugate = 2 * self.size - 1 - self.free_orders
+        self.places = self.orders * self.count + self.nodes
+        """Place of each unknown among the entries of an axis."""
+        self.rows = np.searchsorted(self.free_orders, self.orders) * (self.count + closed) + self.nodes
+        """Place of each equation among the jumps of an axis."""
+        self.prescribed = [self._prescribed(kind) for kind in self.kinds]
+        self.first_position = int(given[:, 0].argmax()) if given[:, 0].any() else None
 
-    def solve(self, table: Array) -> NDArray[Any]:
-        """Free entries (nfree, naxes) from a table (nwaypoints, size, naxes): double, extended or decimal numbers.
+    def _prescribed(self, kind: Kind) -> list[tuple[int, slice]]:
+        """Entries of a kind of segments, and the segments from the first to the last in which each is prescribed."""
+        given = np.concatenate([self.given, self.given[: self.closed]])
+        pairs = zip(kind.sides.tolist(), kind.orders.tolist(), strict=True)
+        used = [given[kind.first + side : kind.last + side, k] for side, k in pairs]
+        positions = np.flatnonzero(kind.orders == 0)
+        if positions.size == 2:  # one is relative to the other
+            used[positions[1]] = used[positions[1]] | used[positions[0]]
+            used[positions[0]] = np.zeros(kind.last - kind.first, dtype=bool)
+        found = [(n, np.flatnonzero(own)) for n, own in enumerate(used)]
+        return [(n, slice(int(own[0]), int(own[-1]) + 1)) for n, own in found if own.size]
+
+    @cached_property
+    def amplification(self) -> float:
+        """Error of the entries relative to rounding times the condition number."""
+        if not self.alpha:  # the weights of polynomials are exact
+            return _POLYNOMIAL
+        return max(max(1.0, segment_system(self.alpha, kind.ends).amplification) for kind in self.kinds)
+
+    @cached_property
+    def sizes(self) -> Array:
+        """Scales (size,) of the entries and equations by order, for which the matrix has entries near 1."""
+        every, orders = tuple(range(self.size)), np.arange(self.size)
+        own = segment_weights(self.alpha, (every, every), self.size)[0, 2 * self.size - 1 - orders, orders]
+        return np.sqrt(np.where(own == 0.0, 1.0, np.abs(own)).astype(float))
+
+    @cached_property
+    def weights(self) -> list[NDArray[Any]]:
+        """Conjugate derivatives (2, nrows, nentries, 1) at both ends of segments, with the signs of a jump, scaled."""
+        found = []
+        for kind in self.kinds:
+            weights = segment_weights(self.alpha, kind.ends, self.size)[:, self.conjugate]
+            weights = weights / self.sizes[self.free_orders, None] / self.sizes[kind.orders]
+            found.append((weights * np.array([1.0, -1.0])[:, None, None])[..., None])
+        return found
+
+    @cached_property
+    def matrix(self) -> _Places:
+        """Places of the weights of all segments in the band matrix."""
+        number = np.full((self.size, self.count), -1, dtype=np.intp)
+        number[self.orders, self.nodes] = np.arange(self.nodes.size)
+        number = np.concatenate([number, number[:, : self.closed]], axis=1)
+        taken, rows, columns, shift = [], [], [], 0
+        for kind in self.kinds:
+            first, last = kind.first, kind.last
+            row = np.stack([number[self.free_orders, first + side : last + side] for side in (0, 1)])[:, :, None]
+            pairs = zip(kind.sides.tolist(), kind.orders.tolist(), strict=True)
+            column = np.array([number[k, first + side : last + side] for side, k in pairs])
+            row, column = np.broadcast_arrays(row, column.reshape(-1, last - first))
+            used = np.flatnonzero((row >= 0) & (column >= 0))
+            taken.append(used + shift)
+            rows.append(row.ravel()[used])
+            columns.append(column.ravel()[used])
+            shift += row.size
+        return _Places(self.nodes.size, *map(np.concatenate, (taken, rows, columns)))
+
+
+class _Places:
+    """Places in a band matrix of the entries of a vector.
+
+    Parameters
+    ----------
+    n : int
+        Number of equations.
+    taken : ndarray of int, shape (nused,)
+        Entries of the vector that are used.
+    row, column : ndarray of int, shape (nused,)
+        Where they are added.
+    """
+
+    def __init__(self, n: int, taken: NDArray[np.intp], row: NDArray[np.intp], column: NDArray[np.intp]) -> None:
+        self.n, self.taken, self.row = n, taken, row
+        self.width = int(np.abs(row - column).max(initial=0))
+        self.height = 3 * self.width + 1  # LAPACK requires space for the fill-in
+        self.place = (2 * self.width + row - column) + self.height * column
+
+
+class FreeEntries:
+    """Equations of the free entries of waypoints at given times.
+
+    Parameters
+    ----------
+    pattern : FreePattern
+        Prescribed entries.
+    times : ndarray, shape (nwaypoints,)
+        Times of the waypoints [s].
+    period : float or None
+        Period of a closed plan.
+    """
+
+    def __init__(self, pattern: FreePattern, times: Array, period: float | None = None) -> None:
+        self.pattern, self._times = pattern, times
+        self._moments = times if period is None else np.append(times, times[0] + period)
+        self._durations = durations = np.diff(self._moments)
+        self._units = np.empty(times.size)
+        np.minimum(durations[:-1], durations[1:], out=self._units[1 : durations.size])
+        self._units[0] = durations[0] if period is None else min(durations[0], durations[-1])
+        if period is None:
+            self._units[-1] = durations[-1]
+        self._ratio = float(durations.max() / durations.min())
+
+    def solve(self, rows: Array) -> NDArray[Any]:
+        """Free entries (naxes, nfree) from entries (naxes, size, nwaypoints): double, extended or decimal numbers.
 
         Raises
         ------
         ValueError
             If the prescribed entries do not determine them, or they overflow.
         """
-        ratio = float(self._durations.max() / self._durations.min())
-        uneven = math.log(ratio) * self._size > math.log(_UNEVEN)
-        open_, few = self._open, self.nodes.size <= _DECIMALS
-        if open_ and few and ratio * SHORT > 1.0:
-            return self._decimal(table)
+        pattern = self.pattern
+        open_, few = pattern.open, pattern.nodes.size <= _DECIMALS
+        if open_ and few and self._ratio * SHORT > 1.0:
+            return self._decimal(rows)
         equations = self._equations
         if equations is not None:
-            extended = _EXTENDED and not self._alpha
-            if equations.loss <= _ACCURATE and not (uneven and extended):
-                return self._checked(self._plain(equations, table))
+            extended = _EXTENDED and not pattern.alpha
+            if equations.loss <= _ACCURATE and not (self._uneven and extended):
+                return self._checked(self._plain(equations, rows))
             if extended and self._determined(equations):
                 # With durations of one size all entries have one scale.
-                found = self._refined(equations, table, 1e-13 if ratio <= _ALIKE and not (open_ and few) else 1e-15)
+                loose = self._ratio <= _ALIKE and not (open_ and few)
+                found = self._refined(equations, rows, 1e-13 if loose else 1e-15)
                 if found is not None:
                     return self._checked(found)
             elif not extended and equations.loss <= _ACCEPTED and not (open_ and few):
-                return self._checked(self._plain(equations, table))
+                return self._checked(self._plain(equations, rows))
         if open_:
-            return self._decimal(table)
+            return self._decimal(rows)
         raise ValueError("free entries at waypoints must be determined by the prescribed ones; prescribe more")
+
+    def estimate(self, rows: Array) -> Array:
+        """The same to about nine digits, for a search over times."""
+        equations = self._equations
+        if equations is not None and equations.loss <= _ACCEPTED:
+            return self._checked(self._plain(equations, rows))
+        return self.solve(rows).astype(float)
+
+    @property
+    def _uneven(self) -> bool:
+        """Whether rounding of the entries matters."""
+        return math.log(self._ratio) * self.pattern.size > math.log(_UNEVEN)
 
     def _determined(self, equations: _Banded) -> bool:
         """Whether the prescribed entries determine the free ones."""
@@ -196,162 +306,152 @@ class FreeEntries:
     @cached_property
     def _even(self) -> _Banded | None:
         """Equations for equal durations: whether entries are determined does not depend on the times."""
-        return self._assembled(np.ones_like(self._durations), np.ones(self._count))
+        return self._assembled(self._terms_of(np.ones_like(self._durations), np.ones_like(self._units)))
 
     @cached_property
     def _equations(self) -> _Banded | None:
         """Factorised equations; None on overflow."""
-        return self._assembled(self._durations, self._units)
+        return self._assembled(self._terms)
 
-    def _plain(self, equations: _Banded, table: Array) -> Array:
-        offset = self._offset(table)
-        shifted = table.copy()
-        shifted[:, 0] -= offset
+    def _plain(self, equations: _Banded, rows: Array) -> Array:
+        offset, shifted = self._shifted(rows)
         with np.errstate(all="ignore"):
-            found = equations.solve(-self._jumps(self._data(shifted), self._terms))
-            return self._restored(found, offset)
+            jumps = self._jumps(self._data(shifted, self._scale), self._terms, self.pattern.prescribed)
+            return self._restored(equations.solve(-jumps), self._unknown_scale, offset)
 
-    def _refined(self, equations: _Banded, table: Array, tolerance: float) -> NDArray[np.longdouble] | None:
+    def _refined(self, equations: _Banded, rows: Array, tolerance: float) -> NDArray[np.longdouble] | None:
         """Solution with residuals in extended precision; None if it does not converge to a relative tolerance."""
-        long = np.longdouble
-        offset = self._offset(table)
-        shifted = table.astype(long)
-        shifted[:, 0] -= offset
+        long, orders = np.longdouble, self.pattern.orders
+        offset, shifted = self._shifted(rows.astype(long))
         durations, units = np.diff(self._moments.astype(long)), self._units.astype(long)
+        every = [
+            [(n, slice(0, kind.last - kind.first)) for n in range(kind.orders.size)] for kind in self.pattern.kinds
+        ]
         with np.errstate(all="ignore"):
-            data, terms = self._data(shifted), self._terms_of(durations, units)
-            found = np.zeros((self.nodes.size, table.shape[2]), dtype=long)
+            terms, scale = self._terms_of(durations, units), self._scale_of(units)
+            data = self._data(shifted, scale)
+            unknown = scale[orders, self.pattern.nodes]
+            found = np.zeros((rows.shape[0], orders.size), dtype=long)
             for _ in range(_REFINEMENTS):
-                change = equations.solve(-self._jumps(data, terms).astype(float))
+                change = equations.solve(-self._jumps(data, terms, every).astype(float))
                 found += change
-                data[self.nodes, self.orders] = found
+                data.reshape(len(data), -1)[:, self.pattern.places] = found
                 size = np.abs(found)
-                peaks = np.array([size[self.orders == k].max(axis=0, initial=0.0) for k in range(self._size)])
-                if (np.abs(change) <= 1e-17 * size + 1e-20 * peaks[self.orders]).all():
-                    return self._restored(found, offset)
-            small = (np.abs(change) <= tolerance * (size + 1e-2 * peaks[self.orders])).all()
-            return self._restored(found, offset) if small else None
+                peaks = np.array([size[:, orders == k].max(axis=1, initial=0.0) for k in range(self.pattern.size)]).T
+                if (np.abs(change) <= 1e-17 * size + 1e-20 * peaks[:, orders]).all():
+                    return self._restored(found, unknown, offset)
+            small = (np.abs(change) <= tolerance * (size + 1e-2 * peaks[:, orders])).all()
+            return self._restored(found, unknown, offset) if small else None
 
-    def _decimal(self, table: Array) -> NDArray[np.object_]:
+    def _decimal(self, rows: Array) -> NDArray[np.object_]:
         """Solution in decimal arithmetic."""
-        even = self._even
+        pattern, even = self.pattern, self._even
         solution = None
-        if even is None or even.condition <= _SINGULAR or self._alpha > NEARLY_CLOSED:
-            ends = [kind.ends for kind in self.kinds for _ in range(kind.first, kind.last)]
-            free = list(zip(self.nodes.tolist(), self.orders.tolist(), strict=True))
-            solution = conjugate_digits(self._alpha, self._times.tolist(), ends, free, table)
+        if even is None or even.condition <= _SINGULAR or pattern.alpha > NEARLY_CLOSED:
+            ends = [kind.ends for kind in pattern.kinds for _ in range(kind.first, kind.last)]
+            free = list(zip(pattern.nodes.tolist(), pattern.orders.tolist(), strict=True))
+            solution = conjugate_digits(pattern.alpha, self._times.tolist(), ends, free, rows.T)
         if solution is None:
             raise ValueError(
                 "free entries at inner waypoints must be determined by the prescribed ones; prescribe more"
             )
-        return self._checked(solution)
+        return self._checked(solution.T)
 
     def _checked(self, found: NDArray[Any]) -> NDArray[Any]:
-        finite = np.isfinite(found.astype(float))
+        finite = np.isfinite(found.astype(float, copy=False))
         if not finite.all():
-            worst = int(np.argwhere(~finite)[0, 0])
+            worst = int(np.argwhere(~finite)[0, 1])
             raise ValueError(
                 "derivatives at inner waypoints must stay within floating point, got an overflow of derivative "
-                f"{self.orders[worst]} at waypoints[{self.nodes[worst]}]; increase the time between neighbouring "
-                "waypoints"
+                f"{self.pattern.orders[worst]} at waypoints[{self.pattern.nodes[worst]}]; increase the time between "
+                "neighbouring waypoints"
             )
         return found
 
-    def _offset(self, table: Array) -> Array:
-        """First prescribed position of each axis: an offset of all positions costs no digits."""
-        given = np.flatnonzero(self._given[:, 0])
-        return np.asarray(table[given[0], 0] if given.size else np.zeros(table.shape[2]))
+    def _shifted(self, rows: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """First prescribed position of each axis, and entries relative to it: an offset costs no digits."""
+        first = self.pattern.first_position
+        if first is None:
+            return np.zeros(len(rows), dtype=rows.dtype), rows
+        offset = rows[:, 0, first].copy()
+        shifted = rows.copy()
+        shifted[:, 0] -= offset[:, None]
+        return offset, shifted
 
-    def _data(self, table: NDArray[Any]) -> NDArray[Any]:
+    def _data(self, rows: NDArray[Any], scale: NDArray[Any]) -> NDArray[Any]:
         """Prescribed entries in the units of the waypoints, 0 where free."""
-        scale = _powers(self._units.astype(table.dtype), self._size - 1) * self._sizes[:, None]
-        return np.asarray(np.where(self._given[:, :, None], table, 0.0) * scale.T[:, :, None])
+        return np.where(self.pattern.mask, rows, 0.0) * scale
 
-    def _restored(self, found: NDArray[Any], offset: Array) -> NDArray[Any]:
+    def _restored(self, found: NDArray[Any], scale: NDArray[Any], offset: NDArray[Any]) -> NDArray[Any]:
         """Entries from those in the units of the waypoints."""
-        scale = _powers(self._units.astype(found.dtype), self._size - 1) * self._sizes[:, None]
-        entries = found / scale[self.orders, self.nodes, None]
-        entries[self.orders == 0] += offset
+        entries = found / scale
+        if not self.pattern.free_orders[0]:
+            entries[:, self.pattern.orders == 0] += offset[:, None]
         return np.asarray(entries)
 
     @cached_property
-    def _sizes(self) -> Array:
-        """Scales (size,) of the entries and equations by order, for which the matrix has entries near 1."""
-        every, orders = tuple(range(self._size)), np.arange(self._size)
-        own = segment_weights(self._alpha, (every, every), self._size)[0, 2 * self._size - 1 - orders, orders]
-        return np.sqrt(np.where(own == 0.0, 1.0, np.abs(own)).astype(float))
-
-    def _weights(self, kind: Kind, dtype: Any) -> NDArray[Any]:
-        """Conjugate derivatives (2, nrows, nentries) at both ends of a segment, with the signs of a jump, scaled."""
-        conjugate = 2 * self._size - 1 - self._free_orders
-        weights = segment_weights(self._alpha, kind.ends, self._size)[:, conjugate]
-        weights = weights / self._sizes[self._free_orders, None] / self._sizes[kind.orders]
-        return np.asarray(weights * np.array([1.0, -1.0])[:, None, None], dtype=dtype)
+    def _scale(self) -> NDArray[Any]:
+        return self._scale_of(self._units)
 
     @cached_property
-    def _terms(self) -> list[tuple[NDArray[Any], ...]]:
-        """Weights and factors of each kind of segment."""
+    def _unknown_scale(self) -> NDArray[Any]:
+        return np.asarray(self._scale[self.pattern.orders, self.pattern.nodes])
+
+    def _scale_of(self, units: NDArray[Any]) -> NDArray[Any]:
+        """Factors (size, nwaypoints) from entries to those in the units of the waypoints."""
+        return _powers(units, self.pattern.size - 1) * self.pattern.sizes[:, None]
+
+    @cached_property
+    def _terms(self) -> list[NDArray[Any]]:
         with np.errstate(all="ignore"):
             return self._terms_of(self._durations, self._units)
 
-    def _terms_of(self, durations: NDArray[Any], units: NDArray[Any]) -> list[tuple[NDArray[Any], ...]]:
-        return [(self._weights(kind, durations.dtype), *self._factors(kind, durations, units)) for kind in self.kinds]
+    def _terms_of(self, durations: NDArray[Any], units: NDArray[Any]) -> list[NDArray[Any]]:
+        """Jumps (2, nrows, nentries, nsegments) at both ends of each segment by its entries, by kind."""
+        pattern, found = self.pattern, []
+        wrapped = np.append(units, units[:1]) if pattern.closed else units
+        for kind, weights in zip(pattern.kinds, pattern.weights, strict=True):
+            h = durations[kind.segments]
+            at = np.stack([wrapped[kind.first + side : kind.last + side] for side in (0, 1)])
+            rows = _powers(at / h, 2 * pattern.size - 1)[pattern.conjugate].swapaxes(0, 1)
+            columns = _powers(h / at, pattern.size - 1)[kind.orders, kind.sides]
+            found.append(np.asarray(weights.astype(durations.dtype, copy=False) * rows[:, :, None] * columns))
+        return found
 
-    def _factors(self, kind: Kind, durations: NDArray[Any], units: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Factors of rows (2, nrows, nsegments) and entries (nentries, nsegments): jumps are in units of waypoints."""
-        h = durations[kind.segments]
-        at = np.stack([units[end] for end in self._ends_of(kind)])
-        conjugate = 2 * self._size - 1 - self._free_orders
-        rows, columns = _powers(at / h, 2 * self._size - 1), _powers(h / at, self._size - 1)
-        return rows[conjugate].swapaxes(0, 1), columns[kind.orders, kind.sides]
-
-    def _ends_of(self, kind: Kind) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Waypoints at both ends of the segments of a kind."""
-        first = np.arange(kind.first, kind.last)
-        return first, (first + 1) % self._count
-
-    def _jumps(self, data: NDArray[Any], terms_of: list[tuple[NDArray[Any], ...]]) -> NDArray[Any]:
-        """Jumps (nfree, naxes) of the conjugate derivatives of piecewise functions with given entries."""
-        naxes = data.shape[2]
-        jumps = np.zeros((self._free_orders.size, self._count, naxes), dtype=data.dtype)
-        for kind, (weights, rows, columns) in zip(self.kinds, terms_of, strict=True):
-            ends = self._ends_of(kind)
-            entries = np.stack([data[ends[side], k] for side, k in zip(kind.sides, kind.orders, strict=True)])
+    def _jumps(
+        self, data: NDArray[Any], terms: list[NDArray[Any]], entries: list[list[tuple[int, slice]]]
+    ) -> NDArray[Any]:
+        """Jumps (naxes, nfree) of the conjugate derivatives, for given entries of each kind in some segments."""
+        pattern, naxes = self.pattern, len(data)
+        if pattern.closed:
+            data = np.concatenate([data, data[:, :, :1]], axis=2)
+        jumps = np.zeros((naxes, pattern.free_orders.size, data.shape[2]), dtype=data.dtype)
+        for kind, factors, used in zip(pattern.kinds, terms, entries, strict=True):
             # Positions relative to the start of each segment, whose functions include the constants.
-            places = np.flatnonzero(kind.orders == 0)
-            if places.size == 2:
-                entries[places[1]] -= entries[places[0]]
-                entries[places[0]] = 0.0
-            entries *= columns[..., None]
-            terms = weights.reshape(-1, len(entries)) @ entries.reshape(len(entries), -1)
-            terms = terms.reshape(2, -1, len(ends[0]), naxes) * rows[..., None]
-            jumps[:, ends[0]] += terms[0]
-            jumps[:, ends[1]] += terms[1]
-        return np.asarray(jumps[self._row, self.nodes])
+            relative = np.count_nonzero(kind.orders == 0) == 2
+            for n, inside in used:
+                side, order = int(kind.sides[n]), int(kind.orders[n])
+                left, right = kind.first + inside.start, kind.first + inside.stop
+                values = data[:, order, left + side : right + side]
+                if relative and not order:
+                    if not side:
+                        continue
+                    values = values - data[:, 0, left:right]
+                if not values.any():
+                    continue
+                change = factors[:, :, n, inside] * values[:, None, None]
+                jumps[:, :, left:right] += change[:, 0]
+                jumps[:, :, left + 1 : right + 1] += change[:, 1]
+        if pattern.closed:
+            jumps[:, :, 0] += jumps[:, :, -1]
+        return np.asarray(jumps.reshape(naxes, -1).take(pattern.rows, axis=1))
 
-    def _assembled(self, durations: Array, units: Array) -> _Banded | None:
+    def _assembled(self, terms: list[NDArray[Any]]) -> _Banded | None:
         """Band matrix of the equations, factorised; None on overflow."""
-        found: list[tuple[Array, ...]] = []
-        with np.errstate(all="ignore"):
-            terms = self._terms if durations is self._durations else self._terms_of(durations, units)
-        for kind, (weights, rows, columns) in zip(self.kinds, terms, strict=True):
-            ends = self._ends_of(kind)
-            number = [self._number[end[:, None], self._free_orders].T for end in ends]
-            for side, r in itertools.product((0, 1), range(self._free_orders.size)):
-                for entry, (other, order) in enumerate(zip(kind.sides, kind.orders, strict=True)):
-                    column = self._number[ends[other], order]
-                    used = (number[side][r] >= 0) & (column >= 0)
-                    with np.errstate(all="ignore"):
-                        value = weights[side, r, entry] * rows[side, r] * columns[entry]
-                    found.append((number[side][r][used], column[used], value[used]))
-        row, column, value = (np.concatenate(part) for part in zip(*found, strict=True))
-        if not np.isfinite(value).all():
-            return None
-        # The weights of polynomials are exact.
-        amplification = (
-            max(_amplification(self._alpha, kind.ends) for kind in self.kinds) if self._alpha else _POLYNOMIAL
-        )
-        return _Banded(self.nodes.size, row, column, value, amplification)
+        places = self.pattern.matrix
+        joined = terms[0].ravel() if len(terms) == 1 else np.concatenate([own.ravel() for own in terms])
+        value = joined.take(places.taken)
+        return _Banded(places, value, self.pattern.amplification) if np.isfinite(value).all() else None
 
 
 class _Banded:
@@ -363,27 +463,29 @@ class _Banded:
         Condition number, and the estimated relative error of a solution.
     """
 
-    def __init__(
-        self, n: int, row: NDArray[np.intp], column: NDArray[np.intp], value: Array, amplification: float
-    ) -> None:
-        self._width = width = int(np.abs(row - column).max(initial=0))
-        place = (2 * width + row - column) + (3 * width + 1) * column  # LAPACK requires space for the fill-in above
-        band = np.bincount(place, value, minlength=(3 * width + 1) * n).reshape(n, -1).T
-        norm = float(np.bincount(row, np.abs(value)).max(initial=0.0))
-        self._lu, self._pivots, info = lapack.dgbtrf(band, width, width, overwrite_ab=True)
+    def __init__(self, places: _Places, value: Array, amplification: float) -> None:
+        n, self._width = places.n, places.width
+        band = np.bincount(places.place, value, minlength=places.height * n).reshape(n, -1).T
+        norm = float(np.bincount(places.row, np.abs(value)).max(initial=0.0))
+        self._lu, self._pivots, info = lapack.dgbtrf(band, self._width, self._width, overwrite_ab=True)
         self.condition = np.inf
         if not info:
             # Solutions for some right sides of size 1 bound the inverse from below, and nearly reach it.
-            signs = np.random.default_rng(0).choice([-1.0, 1.0], (n, _RIGHT_SIDES))
             with np.errstate(all="ignore"):
-                largest = float(np.abs(self.solve(signs)).max(initial=0.0))
+                largest = float(np.abs(self.solve(_signs(n))).max(initial=0.0))
             self.condition = norm * largest if np.isfinite(largest) else np.inf
         self.loss = float(np.finfo(float).eps) * self.condition * amplification
 
     def solve(self, right: Array) -> Array:
-        """Solution (n, naxes)."""
-        found, _ = lapack.dgbtrs(self._lu, self._width, self._width, np.asfortranarray(right), self._pivots)
-        return np.asarray(found)
+        """Solution (naxes, n)."""
+        found, _ = lapack.dgbtrs(self._lu, self._width, self._width, right.T, self._pivots)
+        return np.asarray(found.T)
+
+
+@lru_cache(maxsize=8)
+def _signs(n: int) -> Array:
+    """Random right sides from which the condition number is estimated."""
+    return readonly(np.random.default_rng(0).choice([-1.0, 1.0], (n, _RIGHT_SIDES)).T.copy())
 
 
 @lru_cache(maxsize=256)
@@ -455,10 +557,6 @@ def _long(value: Fraction) -> np.longdouble:
 def segment_system(alpha: float, ends: Ends) -> NewtonSystem:
     """Collocation on the unit segment."""
     return NewtonSystem(alpha, np.array([0.0, 1.0]), ends)
-
-
-def _amplification(alpha: float, ends: Ends) -> float:
-    return max(1.0, segment_system(alpha, ends).amplification)
 
 
 def _powers(base: NDArray[Any], highest: int) -> NDArray[Any]:

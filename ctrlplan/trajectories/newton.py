@@ -202,13 +202,14 @@ class NewtonSystem(Fields):
         return found
 
     def coefficients_of_many(self, taylor_data: NDArray[Any]) -> Array:
-        """The same for many columns, by one product where that is as accurate."""
+        """The same for many columns, which are overwritten, by one product where that is as accurate."""
         if self._inverse is None or taylor_data.dtype != np.float64:
             return self.coefficients_of(taylor_data)
         offset = taylor_data[self._anchor].copy()
-        shifted = taylor_data.copy()
-        shifted[self._positions[:, 0] > 0.0] -= offset
-        found: Array = self._inverse @ shifted
+        for row, position in zip(taylor_data, self._positions, strict=True):
+            if position:
+                row -= offset
+        found: Array = self._inverse @ taylor_data
         found[0] += offset
         return found
 

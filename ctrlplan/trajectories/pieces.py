@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -112,91 +113,122 @@ class Pieces(Fields):
         return system.series(coefficients, u, order)
 
 
-def fitted(
-    alpha: float,
-    axes: Sequence[int],
-    kinds: Sequence[Kind],
-    table: NDArray[Any],
-    times: Array,
-    decimals: NDArray[np.object_] | None = None,
-) -> Pieces:
-    """Functions through complete entries (nsegments + 1, size, naxes), of doubles or extended numbers.
+class Form:
+    """Newton form of consecutive segments of one kind, without the values of their entries.
 
-    Segments much shorter than the longest get all digits of entries in decimals.
+    Parameters
+    ----------
+    alpha : float
+        Shape parameter [rad] of each segment.
+    kind : Kind
+        The segments, and the orders of the entries that determine each.
+    times : ndarray, shape (nsegments + 1,)
+        Ends of all segments of the plan [s].
     """
-    runs, durations = [], np.diff(times.astype(table.dtype))
-    for kind in kinds:
-        system = segment_system(alpha, kind.ends)
-        data = _taylor_data(system, kind, table, durations[kind.segments])
+
+    def __init__(self, alpha: float, kind: Kind, times: Array) -> None:
+        self.kind, self.times = kind, times
+        self.system = segment_system(alpha, kind.ends)
+        self.is_careful = alpha > NEARLY_CLOSED or self.system.amplification > _AMPLIFIED
+        """Whether each segment is fitted with a check of its accuracy."""
+
+    def coefficients(self, rows: NDArray[Any]) -> Array:
+        """Coefficients (size, naxes, nsegments) from entries (naxes, size, nwaypoints)."""
+        system = self.system
+        data = self._taylor_data(rows)
         with np.errstate(over="ignore", invalid="ignore"):
-            if alpha > NEARLY_CLOSED or system.amplification > _AMPLIFIED:
-                found = _carefully_solved(system, kind, table.astype(float), data.astype(float), times)
+            if self.is_careful:
+                found = self._carefully_solved(rows.astype(float, copy=False), data.astype(float, copy=False))
             else:
                 found = system.coefficients_of_many(data.reshape(len(data), -1))
                 found = np.ascontiguousarray(found).reshape(system.size, *data.shape[1:])
-        if not np.isfinite(found.sum()) and not np.isfinite(found).all():
-            wrong = ~np.isfinite(found).all(axis=(0, 1))
+            if not np.isfinite(found.sum()) and not np.isfinite(found).all():
+                wrong = self.kind.first + int(np.flatnonzero(~np.isfinite(found).all(axis=(0, 1)))[0])
+                raise ValueError(
+                    "coefficients must stay within floating point, got an overflow from waypoint entries of up to "
+                    f"{np.abs(rows[:, :, wrong : wrong + 2]).max():g} over {self.durations[wrong - self.kind.first]:g} "
+                    f"s from waypoints[{wrong}]"
+                )
+        return found
+
+    def resolve(self, found: Array, decimals: NDArray[np.object_]) -> None:
+        """Replace the coefficients of short segments, which are sensitive to rounding of the entries at their ends."""
+        system, times, first = self.system, self.times, self.kind.first
+        longest = float(np.diff(times).max())
+        for k in range(first, self.kind.last):
+            duration = float(times[k + 1] - times[k])
+            if duration < SHORT * longest:
+                digits = math.ceil(2 * decimals.shape[1] * math.log10(longest / duration))
+                values = decimals[:, system.order_index, k + system.waypoint_index].T
+                found[:, :, k - first] = system.resolved(values, times[k : k + 2].tolist(), duration, digits)
+
+    @cached_property
+    def durations(self) -> Array:
+        """Durations of the segments [s]."""
+        return self._durations(float)
+
+    def _durations(self, dtype: Any) -> NDArray[Any]:
+        first, last = self.kind.first, self.kind.last
+        times = self.times[first : last + 1].astype(dtype, copy=False)
+        return np.asarray(times[1:] - times[:-1])
+
+    @cached_property
+    def _factors(self) -> list[NDArray[Any]]:
+        return self._factors_of(self.durations)
+
+    def _factors_of(self, durations: NDArray[Any]) -> list[NDArray[Any]]:
+        """Factors from derivatives to Taylor coefficients in relative time, by order."""
+        powers = [np.ones_like(durations)]
+        with np.errstate(over="ignore", under="ignore"):
+            while len(powers) <= self.system.order_index.max():
+                powers.append(powers[-1] * durations)
+        if not (powers[-1].min() > _SMALLEST and powers[-1].max() < np.inf):
+            wrong = durations[~((powers[-1] > _SMALLEST) & (powers[-1] < np.inf))]
             raise ValueError(
-                "coefficients must stay within floating point, got an overflow from waypoint entries of up to "
-                f"{np.abs(table[kind.first : kind.last + 1]).max():g} over {durations[kind.segments][wrong][0]:g} s"
+                f"powers of the duration must stay within floating point, got {wrong[0]:g} s to the power "
+                f"{len(powers) - 1}; choose another unit of time"
             )
-        if decimals is not None and system.hermite:
-            _resolve(system, kind, found, decimals, durations, times)
-        runs.append(Run(system, kind.first, found))
+        return [power / factorial for power, factorial in zip(powers, FACTORIALS.tolist(), strict=False)]
+
+    def _taylor_data(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Taylor data (nentries, naxes, nsegments) in relative time, in the order of the system."""
+        system, first = self.system, self.kind.first
+        factors = self._factors if rows.dtype == float else self._factors_of(self._durations(rows.dtype))
+        count = self.kind.last - first
+        data = np.empty((system.order_index.size, len(rows), count), dtype=rows.dtype)
+        for row, waypoint, order in zip(data, system.waypoint_index.tolist(), system.order_index.tolist(), strict=True):
+            np.multiply(rows[:, order, first + waypoint : first + waypoint + count], factors[order], out=row)
+        return data
+
+    def _carefully_solved(self, rows: Array, data: Array) -> Array:
+        """Coefficients (size, naxes, nsegments), each segment with a check of the rounding errors."""
+        system, first, found = self.system, self.kind.first, []
+        for k in range(first, self.kind.last):
+            values = rows[:, system.order_index, k + system.waypoint_index].T
+            moments = self.times[k : k + 2].tolist()
+            found.append(system.fitted(values, moments, moments[1] - moments[0], data[:, :, k - first]))
+        return np.stack(found, axis=2)
+
+
+def fitted(
+    axes: Sequence[int], forms: Sequence[Form], rows: NDArray[Any], decimals: NDArray[np.object_] | None = None
+) -> Pieces:
+    """Functions through complete entries (naxes, size, nsegments + 1), of doubles or extended numbers.
+
+    Segments much shorter than the longest get all digits of entries in decimals.
+    """
+    runs = []
+    for form in forms:
+        found = form.coefficients(rows)
+        if decimals is not None and form.system.hermite:
+            form.resolve(found, decimals)
+        runs.append(Run(form.system, form.kind.first, found))
     return Pieces(axes, runs)
-
-
-def _taylor_data(system: NewtonSystem, kind: Kind, table: NDArray[Any], durations: NDArray[Any]) -> NDArray[Any]:
-    """Taylor data (nentries, naxes, nsegments) in relative time, in the order of a system."""
-    count, powers = durations.size, [np.ones_like(durations)]
-    with np.errstate(over="ignore", under="ignore"):
-        while len(powers) <= system.order_index.max():
-            powers.append(powers[-1] * durations)
-    if not (powers[-1].min() > _SMALLEST and powers[-1].max() < np.inf):
-        wrong = durations[~((powers[-1] > _SMALLEST) & (powers[-1] < np.inf))]
-        raise ValueError(
-            f"powers of the duration must stay within floating point, got {wrong[0]:g} s to the power "
-            f"{len(powers) - 1}; choose another unit of time"
-        )
-    factors = [power / factorial for power, factorial in zip(powers, FACTORIALS.tolist(), strict=False)]
-    rows = np.ascontiguousarray(table.transpose(1, 2, 0))  # operations along rows are faster
-    data = np.empty((system.order_index.size, table.shape[2], count), dtype=durations.dtype)
-    for row, waypoint, order in zip(data, system.waypoint_index.tolist(), system.order_index.tolist(), strict=True):
-        first = kind.first + waypoint
-        np.multiply(rows[order, :, first : first + count], factors[order], out=row)
-    return data
-
-
-def _carefully_solved(system: NewtonSystem, kind: Kind, table: Array, data: Array, times: Array) -> Array:
-    """Coefficients (size, naxes, nsegments), each segment with a check of the rounding errors."""
-    found = []
-    for k in range(kind.first, kind.last):
-        values, moments = table[k + system.waypoint_index, system.order_index], times[k : k + 2].tolist()
-        found.append(system.fitted(values, moments, moments[1] - moments[0], data[:, :, k - kind.first]))
-    return np.stack(found, axis=2)
 
 
 def _gathered(run: Run, segments: NDArray[np.intp], u: Array, order: int) -> Array:
     taylor = run.system.taylor(u, order)
     return np.asarray(np.einsum("mkt,mat->kat", taylor, run.coefficients[:, :, segments - run.first]))
-
-
-def _resolve(
-    system: NewtonSystem,
-    kind: Kind,
-    found: Array,
-    decimals: NDArray[np.object_],
-    durations: NDArray[Any],
-    times: Array,
-) -> None:
-    """Replace the coefficients of short segments, which are sensitive to rounding of the entries at their ends."""
-    longest = float(durations.max())
-    for k in range(kind.first, kind.last):
-        duration = float(times[k + 1] - times[k])
-        if duration < SHORT * longest:
-            digits = math.ceil(2 * decimals.shape[1] * math.log10(longest / duration))
-            values = decimals[k + system.waypoint_index, system.order_index]
-            found[:, :, k - kind.first] = system.resolved(values, times[k : k + 2].tolist(), duration, digits)
 
 
 def scales(durations: Array, order: int) -> Array:

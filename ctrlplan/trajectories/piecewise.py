@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,11 +16,11 @@ from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.chosen import checked_alpha, chosen_alpha
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
-from ctrlplan.trajectories.conjugate import FreeEntries, Kind, kinds_of, rounded
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.one_time import derivatives, is_moderate
-from ctrlplan.trajectories.pieces import Pieces, fitted, scales
+from ctrlplan.trajectories.pieces import Pieces, Run, scales
 from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
+from ctrlplan.trajectories.piecewise_fit import Frame
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
@@ -105,7 +105,7 @@ class PiecewiseSpline(WaypointSpline):
     _period: float | None
     _entries: Entries
     _filled: Array  # entries with the free ones of inner waypoints, of a closed plan with the return to the first
-    _free: dict[bytes, FreeEntries]  # by pattern of prescribed entries
+    _frame: Frame  # what new values have in common
     _pieces: tuple[Pieces, ...]
 
     def __init__(
@@ -168,7 +168,7 @@ class PiecewiseSpline(WaypointSpline):
         >>> float(np.abs(plan(times) - np.sin(times) ** 3).max()) < 1e-14, plan.breakpoints.size
         (True, 1000)
         """
-        entries = _entries_of(times, values, derivatives)
+        entries = _entries_of(_checked_times(times), values, derivatives)
         points = entries.waypoints() if isinstance(alpha, str) else ()
         plan = cls.__new__(cls)
         plan._fit(entries, chosen_alpha(alpha, points, cls, labels=labels), labels, warn)
@@ -246,30 +246,23 @@ class PiecewiseSpline(WaypointSpline):
         period: float | None = None,
         donor: PiecewiseSpline | None = None,
     ) -> None:
-        """Set all fields but the waypoints; equations of a `donor` at the same times are reused."""
-        times = entries.times
-        if period is not None and times[-1] >= times[0] + period:
-            raise ValueError(
-                f"waypoints of a cyclic plan must lie within one period of {period:g} s from the first, "
-                f"got waypoints[{times.size - 1}].time = {times[-1]}"
-            )
-        with np.errstate(over="ignore"):
-            far = np.flatnonzero(~np.isfinite(np.diff(times)))
-        if far.size:
-            start, end = times[far[0] : far[0] + 2].tolist()
-            raise ValueError(f"duration must be finite and above 0, got {end} s after {start} s")
-        breakpoints = times if period is None else readonly(np.append(times, times[0] + period))
-        free = {} if donor is None else dict(donor._free)
-        filled, pieces = _fitted(entries, alpha, period, breakpoints, free)
+        """Set all fields but the waypoints; what does not depend on values is taken from a `donor` at equal times."""
+        unknown = np.isnan(entries.rows)
+        if donor is not None and np.array_equal(unknown, donor._frame.unknown):
+            frame, names = donor._frame, donor.labels
+        else:
+            frame = Frame(alpha, entries.times, period, unknown)
+            names = checked_labels(labels or entries.labels, entries.table.shape[2])
+        filled, pieces = frame.fitted(entries.rows)
         self._set_fields(
             alpha=alpha,
-            labels=checked_labels(labels or entries.labels, entries.table.shape[2]),
-            breakpoints=breakpoints,
+            labels=names,
+            breakpoints=frame.breakpoints,
             _warn=warn,
             _period=period,
             _entries=entries,
-            _filled=filled,
-            _free=free,
+            _filled=readonly(filled),
+            _frame=frame,
             _pieces=pieces,
         )
 
@@ -376,34 +369,39 @@ class PiecewiseSpline(WaypointSpline):
             ends = np.full((self.naxes, 2), [np.inf, -np.inf])
             for pieces in self._pieces:
                 for run in pieces.runs:
-                    found = run.system.functions.T @ run.coefficients.reshape(run.system.size, -1)
-                    rows = found.reshape(-1, len(pieces.axes), run.last - run.first)
-                    for axis, low, high in zip(pieces.axes, rows.min(axis=(0, 2)), rows.max(axis=(0, 2)), strict=True):
-                        ends[axis] = min(ends[axis, 0], low), max(ends[axis, 1], high)
+                    low, high = _range(run, slice(None))
+                    axes = list(pieces.axes)
+                    ends[axes] = np.stack([np.minimum(ends[axes, 0], low), np.maximum(ends[axes, 1], high)], axis=1)
             remedy = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
             remedy += ", or use fit for samples"
             warn_of_swing(ends, self._entries.times, self._entries.table, self.end, self.labels, remedy)
 
     def _stays_near(self) -> bool:
-        """Whether a bound of the coefficients excludes a swing.
+        """Whether a swing is excluded: by a bound of the coefficients, by the values in segments where that fails.
 
         Of the functions of a segment the first two lead from position to position, and
         the others add a part of their ranges to it, upwards or downwards.
         """
         if self.alpha > math.pi:
             return False
-        positions = np.ascontiguousarray(self._entries.table[:, 0].T)  # extrema of long rows are faster
-        allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (positions.max(axis=1) - positions.min(axis=1))
+        positions = self._entries.rows[:, 0]
+        lowest, highest = positions.min(axis=1), positions.max(axis=1)
+        allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (highest - lowest)
         for pieces in self._pieces:
+            axes = list(pieces.axes)
             for run in pieces.runs:
                 if not run.system.hermite:
                     return False
                 weights = np.array(run.system.ranges[1:])
-                if weights.size:
-                    sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
-                    own = (weights @ sizes).reshape(len(pieces.axes), -1).max(axis=1)
-                    if not (own <= allowed[list(pieces.axes)]).all():
-                        return False
+                if not weights.size:
+                    continue
+                sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
+                own = (weights @ sizes).reshape(len(axes), -1)
+                if (own.max(axis=1) <= allowed[axes]).all():
+                    continue
+                low, high = _range(run, np.flatnonzero(~(own <= allowed[axes, None]).all(axis=0)))
+                if not ((low >= (lowest - allowed)[axes]) & (high <= (highest + allowed)[axes])).all():
+                    return False
         return True
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
@@ -513,7 +511,7 @@ class PiecewiseSpline(WaypointSpline):
     def _segment(self, segment: int) -> NewtonSpline:
         """Spline of one segment."""
         pair = [
-            Waypoint.from_array(float(self.breakpoints[k]), self._filled[k].copy(), None)
+            Waypoint.from_array(float(self.breakpoints[k]), self._filled[:, :, k].T.copy(), None)
             for k in (segment, segment + 1)
         ]
         spline: NewtonSpline = (
@@ -528,96 +526,53 @@ class PiecewiseSpline(WaypointSpline):
         return [*super()._facts(), alpha, ("period", "" if self._period is None else f"{number(self._period)} s")]
 
 
-def _fitted(
-    entries: Entries, alpha: float, period: float | None, breakpoints: Array, free: dict[bytes, FreeEntries]
-) -> tuple[Array, tuple[Pieces, ...]]:
-    """Entries with the free ones of inner waypoints filled in, and the functions of all segments."""
-    table, closed = entries.table, period is not None
-    known = ~np.isnan(table)
-    if known.all() and not closed:
-        kinds = kinds_of(known[:, :, 0], closed)
-        return table, (fitted(alpha, range(table.shape[2]), kinds, table, breakpoints),)
-    filled = np.concatenate([table, table[:1]]) if closed else table.copy()
-    groups: dict[tuple[object, ...], list[tuple[int, ...]]] = {}
-    found: dict[tuple[int, ...], tuple[NDArray[Any], NDArray[np.object_] | None]] = {}
-    of_group: dict[tuple[object, ...], list[Kind]] = {}
-    for axes in alike(known):
-        size = 1 + int(np.flatnonzero(known[:, :, axes[0]].any(axis=0)).max(initial=0))
-        given = known[:, :size, axes[0]]
-        own: NDArray[Any] = table[:, :size, axes]
-        decimals: NDArray[np.object_] | None = None
-        if not given[slice(None) if closed else slice(1, -1)].all():
-            key = given.tobytes()
-            if key not in free:
-                free[key] = FreeEntries(alpha, entries.times, period, given)
-            values = free[key].solve(own)
-            where = free[key].nodes, free[key].orders
-            if values.dtype == object:
-                decimals = own.astype(object)
-                decimals[where] = values
-                values = rounded(values, alpha)
-            own = own.astype(values.dtype)
-            own[where] = values
-        if closed:
-            own = np.concatenate([own, own[:1]])
-        filled[:, :size, axes] = own
-        own_kinds = kinds_of(given, closed)
-        alone = axes if decimals is not None or own.dtype != float else None
-        group: tuple[object, ...] = (size, tuple((kind.ends, kind.first) for kind in own_kinds), alone)
-        groups.setdefault(group, []).append(axes)
-        found[axes], of_group[group] = (own, decimals), own_kinds
-    pieces = []
-    for key_of, members in groups.items():
-        tables = [found[axes][0] for axes in members]
-        whole = tables[0] if len(tables) == 1 else np.concatenate(tables, axis=2)
-        every = [axis for axes in members for axis in axes]
-        pieces.append(fitted(alpha, every, of_group[key_of], whole, breakpoints, found[members[0]][1]))
-    return filled, tuple(pieces)
+def _range(run: Run, segments: slice | NDArray[np.intp]) -> tuple[Array, Array]:
+    """Minimum and maximum (naxes,) in some segments of a run, on a grid."""
+    coefficients = run.coefficients[:, :, segments]
+    found = run.system.functions.T @ coefficients.reshape(run.system.size, -1)
+    values = found.reshape(-1, *coefficients.shape[1:])
+    return values.min(axis=(0, 2)), values.max(axis=(0, 2))
 
 
-def alike(known: NDArray[np.bool_]) -> list[tuple[int, ...]]:
-    """Axes with the same pattern of prescribed entries."""
-    naxes = known.shape[2]
-    if naxes == 1 or (known == known[:, :, :1]).all():
-        return [tuple(range(naxes))]
-    patterns: dict[bytes, tuple[int, ...]] = {}
-    for axis in range(naxes):
-        key = known[:, :, axis].tobytes()
-        patterns[key] = (*patterns.get(key, ()), axis)
-    return list(patterns.values())
-
-
-def _entries_of(times: ArrayLike, values: ArrayLike, derivatives: Mapping[int, ArrayLike] | None) -> Entries:
-    """Checked entries from arrays."""
-    moments, positions = real_array(times, "times"), real_array(values, "values")
+def _checked_times(times: ArrayLike) -> Array:
+    """Two or more finite times that increase, as a new array."""
+    moments = real_array(times, "times")
     if moments.ndim != 1 or moments.size < 2 or not np.isfinite(moments).all():
         raise ValueError(f"times must be two or more finite times, got shape {moments.shape}: {times!r:.60}")
-    wrong = np.flatnonzero(~(np.diff(moments) > 0.0))
-    if wrong.size:
-        i = int(wrong[0]) + 1
+    if not (moments[1:] > moments[:-1]).all():
+        i = int((moments[1:] > moments[:-1]).argmin()) + 1
         raise ValueError(
             f"times must increase strictly, got times[{i}] = {moments[i]} after times[{i - 1}] = {moments[i - 1]}"
         )
-    rows = positions[None] if positions.ndim == 1 else positions
-    if rows.ndim != 2 or rows.shape[1] != moments.size or not len(rows):
+    return readonly(moments.copy())
+
+
+def _entries_of(times: Array, values: ArrayLike, derivatives: Mapping[int, ArrayLike] | None) -> Entries:
+    """Checked entries from arrays, at checked times."""
+    positions = real_array(values, "values")
+    by_axis = positions[None] if positions.ndim == 1 else positions
+    if by_axis.ndim != 2 or by_axis.shape[1] != times.size or not len(by_axis):
         raise ValueError(
-            f"values must have shape (naxes, {moments.size}) or ({moments.size},) as times, got {positions.shape}"
+            f"values must have shape (naxes, {times.size}) or ({times.size},) as times, got {positions.shape}"
         )
     if derivatives is not None and not isinstance(derivatives, Mapping):
         raise TypeError(f"derivatives must be a mapping of orders to arrays, got {derivatives!r:.80}")
     orders = {checked_count(k, "order of derivatives", 1): v for k, v in (derivatives or {}).items()}
-    table = np.full((moments.size, 1 + max(orders, default=0), len(rows)), np.nan)
-    table[:, 0] = rows.T
+    highest = max(orders, default=0)
+    rows = np.empty((len(by_axis), 1 + highest, times.size))
+    rows[:, 0] = by_axis
+    if len(orders) < highest:
+        rows[:, 1:] = np.nan
     for order, given in orders.items():
         row = real_array(given, f"derivatives[{order}]")
-        if row.shape not in ((), moments.shape, positions.shape):
+        if row.shape not in ((), times.shape, positions.shape):
             raise ValueError(
-                f"derivatives[{order}] must be a number or have shape {moments.shape} or {positions.shape} as values, "
+                f"derivatives[{order}] must be a number or have shape {times.shape} or {positions.shape} as values, "
                 f"got {row.shape}"
             )
-        table[:, order] = row[..., None] if row.ndim < 2 else row.T
-    if np.isinf(table).any():
-        i, order, axis = np.argwhere(np.isinf(table))[0].tolist()
+        rows[:, order] = row
+    if np.isinf(rows).any():
+        i, order, axis = np.argwhere(np.isinf(rows.T))[0].tolist()
         name = f"derivatives[{order}]" if order else "values"
-        raise ValueError(f"{name} must be finite or nan (free), got {table[i, order, axis]} at times[{i}], axis {axis}")
-    return Entries(readonly(moments.copy()), readonly(table), np.full(moments.size, table.shape[1]), None)
+        raise ValueError(f"{name} must be finite or nan (free), got {rows[axis, order, i]} at times[{i}], axis {axis}")
+    return Entries(times, readonly(rows).T, np.full(times.size, 1 + highest), None)

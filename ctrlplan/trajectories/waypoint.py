@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -134,6 +135,14 @@ class Waypoint(Displayed, Fields):
         self._set(time, jet, labels)
         return self
 
+    @classmethod
+    def of_checked(cls, time: float, jet: Array, labels: tuple[str, ...] | None, complete: bool) -> Waypoint:
+        """Waypoint from a read-only array without infinite values; as `from_array`, without checks."""
+        self = cls.__new__(cls)
+        values = {"time": time, "jet": jet, "labels": labels, "complete": complete, "naxes": jet.shape[1]}
+        self.__dict__.update(values)
+        return self
+
     def _set(self, time: float, jet: Array, labels: tuple[str, ...] | None) -> None:
         complete = bool(np.isfinite(jet).all())
         if not complete and np.isinf(jet).any():
@@ -258,6 +267,11 @@ class Entries:
         times = readonly(np.array([point.time for point in waypoints]))
         return cls(times, readonly(table), counts, waypoints[0].labels)
 
+    @cached_property
+    def rows(self) -> Array:
+        """The entries by axis, (naxes, order + 1, nwaypoints), as used in computations."""
+        return readonly(np.ascontiguousarray(self.table.T))
+
     def scaled(self, times: Array, rate: float) -> Entries:
         """Same points at other times, with scaled derivatives.
 
@@ -279,9 +293,23 @@ class Entries:
         return Entries(readonly(times), readonly(table), self.counts, self.labels)
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """The waypoints as objects."""
-        rows = zip(self.times.tolist(), self.table, self.counts.tolist(), strict=True)
-        return tuple(Waypoint.from_array(t, jet[:count].copy(), self.labels) for t, jet, count in rows)
+        """The waypoints as objects, which share the memory of the table.
+
+        Raises
+        ------
+        ValueError
+            If an entry is infinite.
+        """
+        counts, rows = self.counts.tolist(), self.table.shape[1]
+        finite = np.isfinite(self.table)
+        jets: Sequence[Array] = list(self.table)
+        if min(counts) < rows:
+            jets = [jet[:count] for jet, count in zip(jets, counts, strict=True)]
+            finite |= (np.arange(rows) >= self.counts[:, None])[:, :, None]
+        cells = zip(self.times.tolist(), jets, np.ravel(finite.all(axis=(1, 2))).tolist(), strict=True)
+        if np.isinf(self.table).any():
+            return tuple(Waypoint.from_array(time, jet, self.labels) for time, jet, _ in cells)
+        return tuple(Waypoint.of_checked(time, jet, self.labels, whole) for time, jet, whole in cells)
 
 
 def waypoint_table(waypoints: Sequence[Waypoint], labels: Sequence[str]) -> Table:
