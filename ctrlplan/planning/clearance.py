@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_finite, checked_number
 from ctrlplan._display import Displayed, Facts, Part, number
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import Trajectory
-from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.batches import segment_bounds
+from ctrlplan.trajectories.common import FACTORIALS, Array
 from ctrlplan.trajectories.repeated import one_pass
 
 _TIGHT = 1e-6  # relative gap between the bound and the attained minimum, unless a clearance is required
 _TOGETHER = 512  # cells up to which their number does not matter for the time of one refinement
+_FEWEST = 4  # cells of each segment at first
 _ROUNDING = 1e-9  # of the coordinates: a plan at rest at exactly the required clearance is certified
 
 
@@ -107,10 +109,9 @@ def clearance(
     """Certified clearance of a plan in the plane from obstacles.
 
     Cells of each segment are refined until a bound, not a sample, is sufficient.
-    In a cell of duration h the distance of the load from its chord is at most
-    h^2/8 times the bound of its acceleration; the ends of the rope move by at
-    most h/2 times the bounds of their speeds. Both bounds come from the jet at the
-    centre and the peaks of the plan. The refinement ends when `required` is
+    In a cell the load stays near the tangent at its centre, up to the further terms
+    of the Taylor polynomial and a bound of its remainder; the ends of the rope move
+    by at most the sum of these terms. The refinement ends when `required` is
     certified; without it, or if it is violated, when the gap between `lower` and
     `minimum` is below 1e-6, relative to a minimum above 1.
 
@@ -161,15 +162,14 @@ def clearance(
     plan = one_pass(plan)
     if not plan.duration:
         raise ValueError("a trajectory must have a duration for its clearance, got a step")
-    cells = _Cells(plan, things, radius, rope)
-    slack = _ROUNDING * float(plan.peak().max(initial=abs(goal or 0.0)))
-    times = np.concatenate([np.linspace(a, b, 65)[:-1] for a, b in itertools.pairwise(plan.breakpoints.tolist())])
-    left, right = times, np.append(times[1:], plan.end)
+    search = _Search(plan, things, radius, rope)
+    slack = _ROUNDING * max(search.size, abs(goal or 0.0))
+    cells = search.cells(max(_TOGETHER // (8 * search.durations.size), _FEWEST))
     lower, spent = np.inf, 0
-    while left.size:
-        spent += left.size
-        bound = cells.bound(left, right)
-        minimum = cells.minimum
+    while cells.centre.size:
+        spent += cells.centre.size
+        bound = search.bound(cells)
+        minimum = search.minimum
         target = minimum - _TIGHT * max(1.0, abs(minimum)) if goal is None or minimum < goal - slack else goal - slack
         open_ = bound < target
         if spent + 2 * np.count_nonzero(open_) > max_cells:
@@ -180,8 +180,8 @@ def clearance(
                 )
             open_[:] = False
         lower = min(lower, float(bound[~open_].min(initial=np.inf)))
-        left, right = _divided(left[open_], right[open_], min(_TOGETHER, max_cells - spent))
-    return cells.result(lower, goal, None if goal is None else lower >= goal - slack)
+        cells = cells.divided(open_, min(_TOGETHER, max_cells - spent))
+    return search.result(lower, goal, None if goal is None else lower >= goal - slack)
 
 
 def checked_obstacles(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
@@ -204,65 +204,98 @@ def checked_rope(rope: Rope | None) -> Rope | None:
     return rope
 
 
-def _divided(left: Array, right: Array, maximum: int) -> tuple[Array, Array]:
-    """Cells divided in two, or in eight if these are not more than a maximum."""
-    parts = 8 if 8 * left.size <= maximum else 2
-    edges = left[:, None] + (right - left)[:, None] * (np.arange(parts + 1) / parts)
-    edges[:, -1] = right
-    return edges[:, :-1].ravel(), edges[:, 1:].ravel()
+class _Cells(NamedTuple):
+    """Cells of segments.
+
+    Attributes
+    ----------
+    segment : ndarray of int, shape (ncells,)
+        Segment of each cell.
+    centre, half : ndarray, shape (ncells,)
+        Time [s] of the centre since the start of the segment, and half of the duration.
+    """
+
+    segment: NDArray[np.intp]
+    centre: Array
+    half: Array
+
+    def divided(self, chosen: NDArray[np.bool_], maximum: int) -> _Cells:
+        """Chosen cells divided in two, or in eight if these are not more than a maximum."""
+        segment, centre, half = self.segment[chosen], self.centre[chosen], self.half[chosen]
+        parts = 8 if 8 * segment.size <= maximum else 2
+        own = np.repeat(half / parts, parts)
+        shares = np.arange(1 - parts, parts, 2)
+        return _Cells(np.repeat(segment, parts), (np.repeat(centre, parts) + own * np.tile(shares, segment.size)), own)
 
 
-class _Cells:
-    """Bounds on cells of a plan's interval, and the minimum clearance so far."""
+class _Search:
+    """Bounds on cells of a plan's segments, and the minimum clearance so far."""
 
     def __init__(self, plan: Trajectory, obstacles: tuple[Obstacle, ...], load: float, rope: Rope | None) -> None:
         self.plan, self.obstacles, self.load, self.rope = plan, obstacles, load, rope
         self.order = 2 if rope is None else max(2, rope.order + 1)
-        self.peaks = np.stack([plan.peak(nu) for nu in range(self.order + 2)])[:, :, None]
-        self.minimum, self.where = np.inf, (0.0, 0, False)
+        self.durations = np.diff(plan.breakpoints)
+        self.minimum = np.inf
+        begins, ends = plan.jet(plan.breakpoints[:-1], 0)[0], plan.jet(plan.breakpoints[1:], 0, left=True)[0]
+        scale = np.maximum(np.abs(begins), np.abs(ends)).max(axis=1)
+        self._top = segment_bounds(plan, self.order + 1, scale / plan.duration ** (self.order + 1))
+        if not np.isfinite(self._top).all():
+            raise ValueError(f"derivatives must be finite to order {self.order + 1}, got inf or nan over the plan")
+        self.size = float(scale.max())
+        for times, points in ((plan.breakpoints[:-1], begins), (plan.breakpoints[1:], ends)):
+            self._meet(times, points, np.stack([thing.distance(points) for thing in obstacles]) - load, "load")
         if rope is not None:
             slopes = np.asarray(rope.slopes(plan), dtype=float)
             if slopes.shape != (rope.order + 1, 2) or not (np.isfinite(slopes).all() and np.all(slopes >= 0.0)):
                 raise ValueError(
                     f"slopes of the rope must be finite, at least 0 and of shape ({rope.order + 1}, 2), got {slopes}"
                 )
-            self.slopes = slopes[:, :, None]
+            self._slopes = slopes[:, :, None]
 
-    def bound(self, left: Array, right: Array) -> Array:
+    def cells(self, parts: int) -> _Cells:
+        """As many cells of each segment."""
+        half = np.repeat(self.durations / (2 * parts), parts)
+        count = self.durations.size
+        return _Cells(np.repeat(np.arange(count), parts), half * np.tile(np.arange(1, 2 * parts, 2), count), half)
+
+    def bound(self, cells: _Cells) -> Array:
         """Lower bound (ncells,) of the clearance in each cell."""
-        centre, half = 0.5 * (left + right), 0.5 * (right - left)
-        jet = self.plan.jet(centre, self.order)
-        # Within a cell the change of a derivative is bounded by the next one's value at the centre and its slope.
-        bounds = np.minimum(self.peaks[:-1], np.abs(jet) + half * self.peaks[1:])
-        speed, acceleration = np.hypot(*bounds[1]), np.hypot(*bounds[2])
-        ends = self.plan.jet(left, 0)[0], self.plan.jet(right, 0, left=True)[0]
-        away = self.load + 0.5 * half**2 * acceleration
-        chords = np.stack([thing.segment_distance(*ends) for thing in self.obstacles])
-        bound: Array = chords.min(axis=0) - away
-        for t, points in zip((left, right, centre), (*ends, jet[0]), strict=True):
-            self._meet(t, np.stack([thing.distance(points) for thing in self.obstacles]) - self.load, False)
+        segment, centre, half = cells
+        jet = self.plan.segments_jet(segment, centre, self.order)
+        times = self.plan.breakpoints[segment] + centre
+        self.size = max(self.size, float(np.abs(jet[0]).max()))
+        # Terms of the Taylor polynomials at the end of the cell, the last of them a bound of the remainder.
+        sizes = np.concatenate([np.abs(jet), self._top[None, :, segment]])
+        powers = half ** np.arange(self.order + 2)[:, None] / FACTORIALS[: self.order + 2, None]
+        reach = half * jet[1]
+        along = [thing.segment_distance(jet[0] - reach, jet[0] + reach) for thing in self.obstacles]
+        bent = np.einsum("kat,kt->at", sizes[2:], powers[2:])
+        bound: Array = np.min(along, axis=0) - (self.load + np.hypot(*bent))
+        self._meet(times, jet[0], np.stack([thing.distance(jet[0]) for thing in self.obstacles]) - self.load, "load")
         if self.rope is not None:
             order = self.rope.order
+            changes = np.stack(
+                [np.einsum("kat,kt->at", sizes[nu + 1 :], powers[1 : len(sizes) - nu]) for nu in range(order + 1)]
+            )
+            moves = np.maximum(np.hypot(*changes[0]), np.sum(self._slopes * changes, axis=(0, 1)))
             top = self.rope.top(jet[: order + 1])
-            moves = half * np.maximum(speed, np.sum(self.slopes * bounds[1 : order + 2], axis=(0, 1)))
             values = np.stack([thing.segment_distance(top, jet[0]) for thing in self.obstacles])
-            self._meet(centre, values, True)
+            self._meet(times, jet[0], values, "rope")
             bound = np.minimum(bound, values.min(axis=0) - moves)
         return bound
 
-    def _meet(self, t: Array, values: Array, rope: bool) -> None:
-        """Update the minimum with values (nobstacles, ntime)."""
+    def _meet(self, times: Array, points: Array, values: Array, part: Literal["load", "rope"]) -> None:
+        """Update the minimum with values (nobstacles, ntime) at positions (2, ntime)."""
         if not np.isfinite(values).all():
             raise ValueError("distances must be finite over the plan, got nan or inf")
-        obstacle, at = np.unravel_index(np.argmin(values), values.shape)
+        obstacle, at = divmod(int(np.argmin(values)), times.size)
         if values[obstacle, at] < self.minimum:
-            self.minimum, self.where = float(values[obstacle, at]), (float(t[at]), int(obstacle), rope)
+            self.minimum = float(values[obstacle, at])
+            x, z = points[:, at].tolist()
+            self._where = (float(times[at]), (x, z), obstacle, part)
 
     def result(self, lower: float, required: float | None, certified: bool | None) -> Clearance:
-        time, obstacle, rope = self.where
-        x, z = self.plan(time).tolist()
-        # Coordinates and distances are rounded; the bound is rounded down.
-        safe = min(lower, self.minimum) - 32.0 * float(np.finfo(float).eps) * max(
-            self.peaks[0].max(), abs(self.minimum)
-        )
-        return Clearance(safe, self.minimum, time, (x, z), obstacle, "rope" if rope else "load", required, certified)
+        """Clearance with a lower bound, which is rounded down."""
+        # Coordinates and distances are rounded.
+        safe = min(lower, self.minimum) - 32.0 * float(np.finfo(float).eps) * max(self.size, abs(self.minimum))
+        return Clearance(safe, self.minimum, *self._where, required, certified)

@@ -110,10 +110,10 @@ class Rectangle:
     def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
         """Minimum signed distance (...) on segments from p (2, ...) to q."""
         a, b = np.broadcast_arrays(_plane(p, "p"), _plane(q, "q"))
-        outside = np.minimum(self.distance(a), self.distance(b))
-        for corner in itertools.product(*(filter(math.isfinite, sides) for sides in (self.x, self.z))):
-            outside = np.minimum(outside, _to_segment(np.array(corner), a, b))
-        # The distance from each side is affine along the segment: the minimum of the maximum is where two are equal.
+        outside = np.asarray(np.minimum(self.distance(a), self.distance(b)))
+        corners = list(itertools.product(*(filter(math.isfinite, sides) for sides in (self.x, self.z))))
+        if corners:
+            outside = np.asarray(np.minimum(outside, _to_segments(np.array(corners), a, b).min(axis=0)))
         ends = [
             (sign * (a[axis] - side), sign * (b[axis] - side))
             for axis, sides in enumerate((self.x, self.z))
@@ -121,13 +121,11 @@ class Rectangle:
             if math.isfinite(side)
         ]
         first, last = (np.stack(values) for values in zip(*ends, strict=True))
-        depth = np.minimum(first.max(axis=0), last.max(axis=0))
-        for i, j in itertools.combinations(range(len(ends)), 2):
-            gap, other = first[i] - first[j], last[j] - last[i]
-            total = gap + other
-            share = np.clip(np.divide(gap, total, out=np.zeros_like(gap), where=total != 0.0), 0.0, 1.0)
-            depth = np.minimum(depth, (first + share * (last - first)).max(axis=0))
-        return np.where(depth > 0.0, outside, depth)
+        near = np.minimum(first, last).max(axis=0) <= 0.0  # not beyond one of the sides as a whole
+        if near.any():
+            depth = _lowest(first[:, near], last[:, near])
+            outside[near] = np.where(depth > 0.0, outside[near], depth)
+        return outside
 
     def corners(self, margin: float) -> Array:
         """Corners of the enlarged rectangle, two for each corner."""
@@ -181,7 +179,7 @@ class Disc:
     def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
         """Minimum signed distance (...) on segments from p (2, ...) to q."""
         a, b = np.broadcast_arrays(_plane(p, "p"), _plane(q, "q"))
-        return np.asarray(_to_segment(np.array(self.centre), a, b) - self.radius)
+        return np.asarray(_to_segments(np.array([self.centre]), a, b)[0] - self.radius)
 
     def corners(self, margin: float) -> Array:
         """Corners of a polygon of 16 sides around the enlarged disc."""
@@ -258,10 +256,24 @@ def _finite_pair(pair: object, name: str) -> tuple[float, float]:
     return first, second
 
 
-def _to_segment(point: Array, p: Array, q: Array) -> Array:
-    """Distance (...) of one point from the segments p-q."""
-    to = point.reshape(2, *[1] * (p.ndim - 1)) - p
+def _lowest(first: Array, last: Array) -> Array:
+    """Minimum (nsegments,) along segments of the maximum of affine functions (nfunctions, nsegments).
+
+    From values at the ends: it is attained there or where two functions are equal.
+    """
+    i, j = np.triu_indices(len(first), 1)
+    gap, other = first[i] - first[j], last[j] - last[i]
+    total = gap + other
+    share = np.clip(np.divide(gap, total, out=np.zeros_like(gap), where=total != 0.0), 0.0, 1.0)
+    equal = (first + share[:, None] * (last - first)).max(axis=1)
+    return np.minimum(np.minimum(first.max(axis=0), last.max(axis=0)), equal.min(axis=0, initial=math.inf))
+
+
+def _to_segments(points: Array, p: Array, q: Array) -> Array:
+    """Distances (npoints, ...) of points (npoints, 2) from the segments p-q."""
+    x, z = points.T.reshape(2, -1, *[1] * (p.ndim - 1)) - p[:, None]
     along = q - p
-    square = np.sum(along * along, axis=0)
-    share = np.divide(np.sum(to * along, axis=0), square, out=np.zeros_like(square), where=square > 0.0)
-    return np.hypot(*(to - np.clip(share, 0.0, 1.0) * along))
+    square = along[0] * along[0] + along[1] * along[1]
+    share = np.divide(x * along[0] + z * along[1], square, out=np.zeros_like(x), where=square > 0.0)
+    share = np.clip(share, 0.0, 1.0)
+    return np.asarray(np.hypot(x - share * along[0], z - share * along[1]))

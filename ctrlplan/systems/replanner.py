@@ -226,7 +226,10 @@ class _Horizons:
             alpha = own if own < 2.0 * math.pi else 0.0
         self.whole = Transition(order, whole, alpha)
         self.period, self.order, self.rate = period, order, self.whole.rate
-        self.step: Array | None = None  # map from coefficients to jets one period later, if it is constant
+        # Maps from coefficients to jets one period later, and from jets to coefficients with the goal reached at rest,
+        # if they are constant.
+        self.step: Array | None = None
+        self.home: Array | None = None
         self._start, self._end = plan.start, plan.end
         if self.shrinking:
             self._minimum = _minimum_horizon(min_horizon, period, whole)
@@ -235,7 +238,8 @@ class _Horizons:
             raise ValueError(
                 f'min_horizon must be given with horizon = "shrinking" only, got {min_horizon} with {whole:g} s'
             )
-        self.step = self.whole.evaluation(period, order)
+        self.step, unit = self.whole.evaluation(period, order), np.eye(order + 1)
+        self.home = self.whole.coefficients(np.concatenate([unit, np.zeros_like(unit)]))
         radius = self.whole.radius(period)
         if not radius < 1.0:
             raise ValueError(
@@ -306,6 +310,15 @@ class _Signals:
         return found
 
     @property
+    def measurements(self) -> list[tuple[int, int]]:
+        """Index of each measured input and of the planned one: all axes of one derivative after another."""
+        if self.measured is None:
+            return []
+        seen, planned = self.measured + 1, self.planned + 1
+        naxes, first = len(self.inner) // planned, self.seen_rows.start
+        return [(first + axis * seen + k, axis * planned + k) for k in range(seen) for axis in range(naxes)]
+
+    @property
     def passed(self) -> list[int]:
         """Index of the planned input of each output."""
         each, naxes = self.planned + 1, len(self.inner) // (self.planned + 1)
@@ -361,7 +374,9 @@ class _Correction(SampledBlock):
             limits,
         )
         self._bounds = self._bounds_of(horizons.whole) if limits else None
+        self._positions = dict(limits).get(0)
         self._passed, self._naxes, self._order = signals.passed, naxes, order
+        self._seen, self._period = signals.measurements, horizons.period
         self._final = plan.final.tolist()
         self._goal, self._fitted = slice(5, 5 + ngoals), fitted
         self._stop, self._stopped = stop, slice(fitted.stop, len(states))
@@ -369,54 +384,70 @@ class _Correction(SampledBlock):
         self._range = float((extrema.maximum - extrema.minimum).max())
         self._scales = [horizons.whole.horizon**k for k in range(order + 1)]
         # The goal is the end of the plan, with the plan's derivatives if shrinking, otherwise with zero derivatives.
-        self._arrival = np.zeros((order + 1, naxes))
-        self._arrival[0] = plan.final
+        self._arrival = [self._final, *[[0.0] * naxes] * order]
         if horizons.shrinking:
-            self._arrival = _without_rounding(plan.jet(plan.end, order), np.array(self._scales)[:, None], self._range)
+            arrival = _without_rounding(plan.jet(plan.end, order), np.array(self._scales)[:, None], self._range)
+            self._arrival = arrival.tolist()
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
         """States after a fit; unchanged if none is due."""
-        after = x.copy()
-        after[_NAN_INPUT] = 0.0 if math.isfinite(sum(u.tolist())) else 1.0
-        if self._stop is not None and u[-1] > 0.5:
-            if not self._is_stopped(x):
+        after, values = x.copy(), u.tolist()
+        finite = math.isfinite(sum(values))
+        after[_NAN_INPUT] = 0.0 if finite else 1.0
+        stopped = self._is_stopped(x)
+        if self._stop is not None and values[-1] > 0.5:
+            if not stopped:
                 after[self._stopped] = self._stop.begun(t, self._reference(t, x, u, 2))
             return after
-        if after[_NAN_INPUT]:
+        if not finite:
             return after
-        goal = u[self._signals.goal_rows].reshape(self._naxes, -1).T
+        goal = self._goal_of(values)
         miss = self._miss(t, x, goal)
         moved = miss > _ROUNDING
-        begins, resumes = self._deviation(t, x, u), self._is_stopped(x)
-        if resumes:
+        begins = self._deviation(t, x, u, values)
+        if stopped:
             miss = self._distance(t, x, goal)
-        after[_UNREACHABLE] = float(miss > _MATTERS and self._horizons.too_short(t))
-        found = self._horizons.at(t) if resumes or self._is_due(moved, t, x, begins) else None
+        after[_UNREACHABLE] = 1.0 if miss > _MATTERS and self._horizons.too_short(t) else 0.0
+        found = self._horizons.at(t) if stopped or self._is_due(moved, t, x, begins) else None
         if found is None:
             return after
-        jets = np.zeros((2 * (self._order + 1), self._naxes))
-        jets[: self._order + 1] = begins
-        if len(goal):
-            last = slice(self._order + 1, self._order + 1 + len(goal))
-            jets[last] = extrapolated(goal, found.horizon) - self._arrival[: len(goal)]
-        coefficients = found.coefficients(jets)
+        coefficients = self._coefficients(found, begins, goal)
         if self._limits and not self._within_limits(t, found, coefficients, goal):
             after[_UNREACHABLE] = 1.0
             return after
         after[_START], after[_END], after[_UNREACHABLE] = t, self._horizons.end(t), 0.0
         after[_FITS] += 1.0
-        after[self._goal] = goal.ravel()
+        if goal:
+            after[self._goal] = [value for row in goal for value in row]
         after[self._fitted] = coefficients.ravel()
-        after[self._stopped] = 0.0
+        if stopped:
+            after[self._stopped] = 0.0
         return after
+
+    def _goal_of(self, values: list[float]) -> list[list[float]]:
+        """Derivatives of the goal, each by axis, among the inputs."""
+        rows = self._signals.goal_rows
+        each = (rows.stop - rows.start) // self._naxes
+        return [values[rows.start + k : rows.stop : each] for k in range(each)]
+
+    def _coefficients(self, found: Transition, begins: list[float], goal: list[list[float]]) -> Array:
+        """Coefficients of the correction from a jet, in one list, to the change of the goal."""
+        if not goal and found is self._horizons.whole and self._horizons.home is not None:
+            return self._horizons.home.dot(np.array(begins).reshape(-1, self._naxes))
+        ends = [
+            value - arrival
+            for row, own in zip(_extrapolated(goal, found.horizon), self._arrival, strict=False)
+            for value, arrival in zip(row, own, strict=True)
+        ]
+        return found.coefficients_of_row([*begins, *ends, *[0.0] * (len(begins) - len(ends))])
 
     def _is_stopped(self, x: Array) -> bool:
         """Whether the reference stops or has stopped."""
         return self._stop is not None and bool(x[self._stopped.start] > 0.5)
 
-    def _distance(self, t: float, x: Array, goal: Array) -> float:
+    def _distance(self, t: float, x: Array, goal: list[list[float]]) -> float:
         """Distance of the stopped reference from the goal, relative to the move."""
-        target = goal[0] if len(goal) else self._arrival[0]
+        target = np.array(goal[0] if goal else self._final)
         position = self._stop_jets(t, x, 0)[0]
         return float(np.abs(target - position).max()) / max(self._range, float(np.abs(target).max())) or 0.0
 
@@ -429,56 +460,52 @@ class _Correction(SampledBlock):
         planned = u[: len(self._signals.inner)].reshape(self._naxes, -1)[:, : order + 1].T
         return planned + np.array(self._corrections(t, x.tolist(), order)).T
 
-    def _is_due(self, moved: bool, t: float, x: Array, begins: Array) -> bool:
+    def _is_due(self, moved: bool, t: float, x: Array, begins: list[float]) -> bool:
         if moved or self._trigger.kind == "goal":
             return moved
         if self._trigger.kind == "deviation":
-            off = begins[0] - self._jets(t, x, 0)[0]
-            return math.hypot(*off.tolist()) > self._trigger.threshold
+            off = [seen - own for seen, own in zip(begins, self._jets(t, x, 0), strict=False)]
+            return math.hypot(*off) > self._trigger.threshold
         # From the reference to the same goal over the remaining time the fit would be the same plan.
         return self._signals.measured is not None or not self._horizons.shrinking
 
-    def _miss(self, t: float, x: Array, goal: Array) -> float:
+    def _miss(self, t: float, x: Array, goal: list[list[float]]) -> float:
         """Distance of the goal from its extrapolation by the last fit or the plan, relative to the move."""
-        if not len(goal):
+        if not goal:
             return 0.0
         if x[_FITS] > 0.5:
-            expected = extrapolated(x[self._goal].reshape(goal.shape), t - x[_START])
-        elif self._arrival[1 : len(goal)].any():
+            last = x[self._goal].tolist()
+            rows = [last[k : k + self._naxes] for k in range(0, len(last), self._naxes)]
+            expected = _extrapolated(rows, t - float(x[_START]))
+        elif any(value for row in self._arrival[1 : len(goal)] for value in row):
             return math.inf  # after its end the plan has zero derivatives, which requires a fit
         else:
-            expected = self._arrival[: len(goal)]
-        rows = list(zip(goal.tolist(), expected.tolist(), strict=True))
-        size = max(self._range, *map(abs, rows[0][0]), *map(abs, rows[0][1]))
-        far = [
+            expected = self._arrival
+        size = max(self._range, *map(abs, goal[0]), *map(abs, expected[0]))
+        far = max(
             abs(a - b) * scale
-            for row, scale in zip(rows, self._scales, strict=False)
-            for a, b in zip(*row, strict=True)
-        ]
-        return max(far) / size if size else math.inf if any(far) else 0.0
+            for row, own, scale in zip(goal, expected, self._scales, strict=False)
+            for a, b in zip(row, own, strict=True)
+        )
+        return far / size if size else math.inf if far else 0.0
 
-    def _deviation(self, t: float, x: Array, u: Array) -> Array:
-        """Jet (order + 1, naxes) at the start of a fit, minus that of the plan."""
-        highest, stopped = self._signals.measured, self._is_stopped(x)
-        if highest is None and not stopped:
-            return self._jets(t, x, self._order)
-        planned = u[: len(self._signals.inner)].reshape(self._naxes, -1).T
+    def _deviation(self, t: float, x: Array, u: Array, values: list[float]) -> list[float]:
+        """Jet at the start of a fit minus that of the plan: all axes of one derivative after another."""
+        highest = self._signals.measured
         if highest == self._order:
-            own = planned[:0]
-        elif stopped:
-            own = self._stop_jets(t, x, self._order) - planned[: self._order + 1]
+            return [values[seen] - values[planned] for seen, planned in self._seen]
+        if self._is_stopped(x):
+            planned = u[: len(self._signals.inner)].reshape(self._naxes, -1)[:, : self._order + 1].T
+            own = (self._stop_jets(t, x, self._order) - planned).ravel().tolist()
         else:
             own = self._jets(t, x, self._order)
-        if highest is None:
-            return own
-        seen = u[self._signals.seen_rows].reshape(self._naxes, -1).T - planned[: highest + 1]
-        return np.concatenate([seen, own[highest + 1 :]])
+        return [*(values[seen] - values[planned] for seen, planned in self._seen), *own[len(self._seen) :]]
 
-    def _within_limits(self, t: float, found: Transition, coefficients: Array, goal: Array) -> bool:
+    def _within_limits(self, t: float, found: Transition, coefficients: Array, goal: list[list[float]]) -> bool:
         """Whether the plan with a correction satisfies the limits until the end of both."""
         if self._is_bounded(found, coefficients, goal):
             return True
-        met = self._horizons.end(t)
+        met, targets = self._horizons.end(t), np.array(goal).reshape(-1, self._naxes)
         end = max(met, self._plan.end)
         edges = np.unique([t, met, end, *self._plan.breakpoints.tolist()])
         for left, right in itertools.pairwise(edges[edges >= t].tolist()):
@@ -487,7 +514,7 @@ class _Correction(SampledBlock):
                 planned = self._plan.segment_jet_at(0.5 * (left + right), left, s, order)
                 if right <= met:
                     return planned + found.jet(coefficients, s + (left - t), order)
-                after_end = extrapolated(goal, left - t)
+                after_end = extrapolated(targets, left - t)
                 after_end = np.concatenate([after_end, np.zeros((order + 1, self._naxes))])[: order + 1]
                 after_end[0] -= self._plan.final if len(goal) else 0.0
                 return planned + np.stack([extrapolated(after_end, value) for value in s.tolist()], axis=2)
@@ -498,18 +525,20 @@ class _Correction(SampledBlock):
                     return False
         return True
 
-    def _is_bounded(self, found: Transition, coefficients: Array, goal: Array) -> bool:
+    def _is_bounded(self, found: Transition, coefficients: Array, goal: list[list[float]]) -> bool:
         """Whether bounds of the plan and of the correction satisfy the limits together."""
         bounds = self._bounds if found is self._horizons.whole else self._bounds_of(found)
-        if bounds is None or goal[1:].any():
+        if bounds is None or any(value for row in goal[1:] for value in row):
             return False
         matrix, room = bounds
-        if (np.abs(matrix @ coefficients) > room).any():
+        if np.count_nonzero(np.abs(matrix.dot(coefficients)) > room):
             return False
         # After the end of the correction the plan is shifted to the goal.
-        position = dict(self._limits).get(0)
-        shift = np.abs(goal[0] - self._plan.final) if len(goal) else 0.0
-        return position is None or bool((shift + self._plan.peak(0) <= position).all())
+        position = self._positions
+        if position is None:
+            return True
+        shift = np.abs(np.array(goal[0]) - self._plan.final) if goal else 0.0
+        return bool((shift + self._plan.peak(0) <= position).all())
 
     def _bounds_of(self, found: Transition) -> tuple[Array, Array] | None:
         """Matrix from coefficients to values that enclose limited derivatives, and bounds of these values."""
@@ -533,12 +562,13 @@ class _Correction(SampledBlock):
             found = [value * (1.0 - stopped) + held * stopped for value, held in zip(found, jets, strict=True)]
         return np.array(found)
 
-    def _jets(self, t: float, x: Array, order: int) -> Array:
-        """Jet (order + 1, naxes) of the correction."""
+    def _jets(self, t: float, x: Array, order: int) -> list[float]:
+        """Jet of the correction: all axes of one derivative after another."""
         step = self._horizons.step
-        if step is not None and order == self._order and abs(t - x[_START] - self.period) <= 1e-15 * abs(t):
-            return step @ x[self._fitted].reshape(-1, self._naxes)
-        return np.array(self._corrections(t, x.tolist(), order)).T
+        if step is not None and order == self._order and abs(t - x[_START] - self._period) <= 1e-15 * abs(t):
+            found: list[float] = step.dot(x[self._fitted].reshape(-1, self._naxes)).ravel().tolist()
+            return found
+        return [value for row in zip(*self._corrections(t, x.tolist(), order), strict=True) for value in row]
 
     def _corrections(self, t: Value, x: Value, order: int) -> list[list[Value]]:
         """Jets of the correction axis by axis, numeric or symbolic."""
@@ -557,6 +587,14 @@ class _Correction(SampledBlock):
                 after_end[k] = after_end[k] + changed * taylor_value(goal[k:], t - x[_START])
             found.append([value * live * math.factorial(k) + after_end[k] for k, value in enumerate(row)])
         return found
+
+
+def _extrapolated(rows: list[list[float]], time: float) -> list[list[float]]:
+    """Derivatives, each by axis, of the Taylor polynomials after `time` seconds; as `extrapolated`."""
+    if len(rows) == 1:
+        return rows
+    columns = [[taylor_value(column[k:], time) for k in range(len(rows))] for column in zip(*rows, strict=True)]
+    return [list(row) for row in zip(*columns, strict=True)]
 
 
 def _without_rounding(jet: Array, scale: Array, size: float) -> Array:

@@ -89,6 +89,27 @@ def inner_extrema(plan: Segmented, nu: int, low: Array, high: Array) -> tuple[ND
     return segments, (pieces.first[chosen] + pieces.width[chosen] * parts) * np.diff(plan.breakpoints)[segments]
 
 
+def segment_bounds(plan: Segmented, nu: int, size: Array) -> Array:
+    """Bounds (naxes, nsegments) of the magnitude of a derivative on each segment.
+
+    The sum of the magnitudes of the coefficients of interpolants, which is usually
+    little above the maximum.
+
+    Parameters
+    ----------
+    plan : Segmented
+        Plan whose segments are evaluated together.
+    nu : int
+        Order of the derivative.
+    size : ndarray, shape (naxes,)
+        Magnitudes relative to which rounding is judged.
+    """
+    pieces = _interpolated(plan, nu, size)
+    found = np.zeros((plan.breakpoints.size - 1, plan.naxes))
+    np.maximum.at(found, pieces.segment, (np.abs(pieces.series).sum(axis=2) + pieces.slack).T)
+    return found.T
+
+
 def _interpolated(plan: Segmented, nu: int, size: Array) -> _Pieces:
     """Interpolants of a derivative, whose magnitude is at least `size` (naxes,)."""
     durations = np.diff(plan.breakpoints)

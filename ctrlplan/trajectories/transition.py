@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import NamedTuple
@@ -21,6 +22,9 @@ from ctrlplan.trajectories.piecewise_extrema import bernstein
 
 _AMPLIFIED = 1e4
 """Amplification of rounding errors above which the coefficients are found by a triangular solution."""
+
+_DECADES = 290.0
+"""Maximum magnitude of the powers of a horizon, as a decimal logarithm."""
 
 
 class Transition(Displayed, Fields):
@@ -70,21 +74,20 @@ class Transition(Displayed, Fields):
     rate: float
     _system: NewtonSystem
     _rows: NDArray[np.intp]
-    _matrix: Array | None  # from jets relative to the position at the start to coefficients
-    _data_scale: Array
-    _time_scale: Array
+    _matrix: Array | None  # from jets, the position at the end relative to that at the start, to coefficients
+    _powers: Array  # of the horizon
 
     def __init__(self, order: int, horizon: float, alpha: float = 0.0) -> None:
         order = checked_count(order, "order")
         horizon = checked_finite(horizon, "horizon", above=0.0)
         alpha = checked_alpha(alpha)
         family = _family(order, alpha)
-        with np.errstate(over="ignore", under="ignore"):
-            powers = horizon**family.exponents
-        if not 1e-290 < powers[-1] < 1e290:
+        highest = 2.0 * order + 1.0
+        if not abs(highest * math.log10(horizon)) < _DECADES:
             raise ValueError(
-                f"powers of the horizon must stay within floating point, got {horizon:g} s to the power {2 * order + 1}"
+                f"powers of the horizon must stay within floating point, got {horizon:g} s to the power {highest:g}"
             )
+        powers = horizon**family.exponents
         self._set_fields(
             order=order,
             horizon=horizon,
@@ -94,9 +97,8 @@ class Transition(Displayed, Fields):
             _rows=family.rows,
             _matrix=None
             if family.matrix is None
-            else family.matrix * (powers[family.jet_orders] * family.jet_inverse)[1:] / powers[:, None],
-            _data_scale=(powers[family.system.order_index] * family.inverse)[:, None],
-            _time_scale=(1.0 / powers)[:, None],
+            else family.matrix * (powers[family.jet_orders] * family.jet_inverse) / powers[:, None],
+            _powers=powers,
         )
 
     def _describe(self) -> Iterator[Part]:
@@ -125,15 +127,25 @@ class Transition(Displayed, Fields):
         -------
         ndarray, shape (2 (order + 1), naxes)
         """
-        if self._matrix is not None:
-            own = jets[1:].copy()
-            own[self.order] -= jets[0]  # relative to the start, as in `NewtonSystem.coefficients`
-            solved: Array = self._matrix @ own
-            solved[0] += jets[0]
-            return solved
-        data = jets[self._rows]
-        found = self._system.fitted(data, (0.0, self.horizon), self.horizon, data * self._data_scale)
-        return found * self._time_scale
+        return self.coefficients_of_row(jets.ravel().tolist())
+
+    def coefficients_of_row(self, jets: Sequence[float]) -> Array:
+        """Coefficients, as `coefficients`, of jets in one sequence: all axes of one derivative after another."""
+        naxes, own = len(jets) // len(self._rows), list(jets)
+        if self._matrix is None:
+            data = np.array(own).reshape(-1, naxes)[self._rows]
+            scale = self._powers[self._system.order_index] / FACTORIALS[self._system.order_index]
+            return self._system.fitted(data, (0.0, self.horizon), self.horizon, data * scale[:, None]) * self._time_scale
+        # Positions relative to the start, as in `NewtonSystem.coefficients`.
+        first = (self.order + 1) * naxes
+        for axis in range(naxes):
+            own[first + axis] -= own[axis]
+        return self._matrix.dot(np.array(own).reshape(-1, naxes))
+
+    @property
+    def _time_scale(self) -> Array:
+        """Inverse powers of the horizon, shape (2 (order + 1), 1)."""
+        return np.asarray((1.0 / self._powers)[:, None])
 
     def jet(self, coefficients: Array, s: Array, order: int) -> Array:
         """Jet (order + 1, naxes, ntime) at times s [s] after the start."""
@@ -181,10 +193,9 @@ class _Family(NamedTuple):
     system: NewtonSystem
     rows: NDArray[np.intp]  # of the jets at both ends, in the order of the system
     exponents: Array
-    inverse: Array  # of the factorials
     jet_orders: NDArray[np.intp]  # of the jets at both ends
     jet_inverse: Array  # of their factorials
-    matrix: Array | None  # from Taylor data of the jets, without the first, to coefficients; None if that loses digits
+    matrix: Array | None  # from Taylor data of the jets to coefficients; None if that loses digits
 
 
 @lru_cache(maxsize=4096)
@@ -195,10 +206,11 @@ def _family(order: int, alpha: float) -> _Family:
     rows = system.waypoint_index * (order + 1) + system.order_index
     matrix = None
     if system.amplification < _AMPLIFIED and alpha < NEARLY_CLOSED:
-        matrix = system.coefficients(np.eye(len(rows)))[:, np.argsort(rows)[1:]].copy()
-    exponents, inverse = np.arange(2.0 * order + 2.0), 1.0 / FACTORIALS[system.order_index]
+        matrix = system.coefficients(np.eye(len(rows)))[:, np.argsort(rows)].copy()
+        # A position at both ends is that of a constant.
+        matrix[:, 0] = np.eye(len(rows))[0]
     orders = np.arange(2 * order + 2) % (order + 1)
-    return _Family(system, rows, exponents, inverse, orders, 1.0 / FACTORIALS[orders], matrix)
+    return _Family(system, rows, np.arange(2.0 * order + 2.0), orders, 1.0 / FACTORIALS[orders], matrix)
 
 
 @lru_cache(maxsize=4096)

@@ -195,6 +195,26 @@ def test_no_sample_is_nearer_than_the_bound_and_the_bound_is_near(family, places
     assert not clearance(plan, obstacles, load=load, rope=rope, required=found.minimum + 1e-4).certified
 
 
+def test_thousands_of_segments_within_the_tolerance():
+    times = np.arange(3000.0)
+    places = np.random.default_rng(5).uniform(-5.0, 5.0, (2, times.size))
+    plan = cp.PiecewiseSpline.from_arrays(times, places, warn=False)
+    things = [Disc((0.0, 0.0), 1.0), Rectangle((6.0, 7.0), (1.0, 2.0))]
+    found = clearance(plan, things)
+    samples = plan.jet(np.linspace(plan.start, plan.end, 90_001), 0)[0]
+    minimum = min(naive(thing, *samples).min() for thing in things)
+    assert found.lower <= found.minimum <= minimum + 1e-6
+    assert found.lower >= found.minimum - 1e-6
+
+
+def test_the_date_of_a_plan_does_not_matter():
+    points = [cp.Waypoint(0, [0, 5], 0, 0), cp.Waypoint(4, [9, 1]), cp.Waypoint(8, [20, 5], 0, 0)]
+    plan, things = cp.PolySpline(points), [Disc((13.0, -3.0), 1.0)]
+    now, later = clearance(plan, things), clearance(plan.shift(2.0**30), things)
+    assert later.minimum == pytest.approx(now.minimum, abs=1e-12)
+    assert later.lower == pytest.approx(now.lower, abs=1e-12)
+
+
 def test_clearance_is_frozen():
     found = clearance(ACROSS, [Disc((10.0, 9.0), 1.0)])
     with pytest.raises(dataclasses.FrozenInstanceError):
