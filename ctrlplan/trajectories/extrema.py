@@ -283,7 +283,7 @@ class _Search:
         durations = self._durations[segments, None]
         times = np.concatenate([durations * _between(count), 0.0 * durations, durations], axis=1)
         every, t = np.repeat(segments, count + 2), times.ravel()
-        chunks = -(-t.size // 1024)  # fit into the cache
+        chunks = -(-t.size // 4096)  # fit into the cache
         pairs = zip(np.array_split(every, chunks), np.array_split(t, chunks), strict=True)
         rows = np.concatenate([self._values(*pair) for pair in pairs], axis=1)
         self._keep_best(every, t, rows)
