@@ -395,19 +395,28 @@ def _fastest(
         limited.check_smooth(plan)
         if isinstance(plan, PathPlan):
             return _fastest_between_stops(plan, limited, span)
-        if limited.order > HIGHEST:
-            _check_open(plan)
-    uniform = fastest_within(plan, limited, span)
-    if hold == "shape":
-        return uniform
+        return _fastest_by_signals(plan, limited, span)
+    return fastest_within(plan, limited, span)
+
+
+def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, float] | None) -> Fastest:
+    """Plan of short duration on its path, under limits of any signals."""
     # The values of the time law are times: relative to the start they have full precision.
-    begun = uniform.plan.shift(-plan.start)
-    if limited.order > HIGHEST:
-        retimed = fastest_within(with_fast_time_law(begun, limited).shift(plan.start), limited, span)
+    start, law = plan.start, None
+    if limited.order <= HIGHEST:
+        _check_rest(plan, limited)
+        _closed_form(plan, limited)  # raises for a sign that is infeasible at every duration
+        law = fast_law_of_signals(plan.shift(-start), limited)
+        found = None if law is None or span is not None else _at_its_limit(law.shift(start), limited)
+        if found is not None:
+            return found
     else:
-        law = fast_law_of_signals(begun, limited).shift(plan.start)
-        retimed = (_at_its_limit(law, limited) if span is None else None) or fastest_within(law, limited, span)
-    return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
+        _check_open(plan)
+    uniform = fastest_within(plan, limited, span)
+    if limited.order > HIGHEST:
+        law = with_fast_time_law(uniform.plan.shift(-start), limited)
+    retimed = uniform if law is None else fastest_within(law.shift(start), limited, span)
+    return replace(min(retimed, uniform, key=lambda found: found.duration), hold="path")
 
 
 def _check_not_vanishing(plan: Trajectory, found: Fastest) -> None:

@@ -14,7 +14,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.trajectories.batches import inner_extrema
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, points, real_roots, roots_of_rows, transform
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, points, roots_of_rows, transform
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.piecewise_extrema import Places
 
@@ -28,6 +28,7 @@ _SAMPLES = 8192  # minimum number of times at which such a function is evaluated
 
 _MAX_PIECES = 20_000
 _CHUNK = 256  # pieces that are evaluated together
+_DEEPEST = 50  # number of halvings of a segment to the resolution of floating-point times
 _FIT = 32  # degree of an interpolant
 _CHECKS = 8  # minimum number of check points of a piece, none of them a node of its interpolant
 _ROUNDING = 8.0 * float(np.finfo(float).eps)
@@ -232,9 +233,28 @@ def function_extrema(
         If the function is not resolved with `_MAX_PIECES` pieces.
     """
     search = _Search(plan, function, order, np.asarray(scale, dtype=float))
-    for segment in range(len(search.segments)):
-        search.bisect(segment)
+    for samples in search.samples:
+        search.bisect(samples)
     return search.found.extrema()
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Values of a function at times in segments that have the same number of them.
+
+    Attributes
+    ----------
+    segments : ndarray of int, shape (nsegments,)
+        Numbers of the segments.
+    count : int
+        Number of times in each segment.
+    values : ndarray, shape (nrows, nsegments, count)
+        Values.
+    """
+
+    segments: NDArray[np.intp]
+    count: int
+    values: Array
 
 
 class _Search:
@@ -244,50 +264,63 @@ class _Search:
     at check points; where the function varies by less than the tolerance (about a
     kink); or at the resolution of floating-point times (at a jump). A piece is
     skipped if its values differ from the extrema found so far by more than
-    their own range.
+    their own range. Pieces of many segments are evaluated together.
     """
 
     def __init__(self, plan: Trajectory, function: Callable[[Array], Array], order: int, scale: Array) -> None:
-        self.segments = _searchable_segments(plan)
         self.found = _Candidates()
         self._plan, self._function, self._order, self._scale = plan, function, order, scale
+        self._starts, self._durations = _searchable_segments(plan)
         self._spent = 0
-        self._samples: list[Array] = []
+        self._low, self._high = np.inf, -np.inf
         self._best: dict[tuple[int, float], tuple[int, float, float]] = {}  # segment, time and value by row and sign
-        for segment, (_, duration) in enumerate(self.segments):
-            share = max(duration / plan.duration, 1.0 / len(self.segments))
-            count = 2 ** math.ceil(math.log2(max(_SAMPLES * share, 64)))
-            parts = np.array_split(duration * _between(count), -(-count // 1024))  # fit into the cache
-            parts.append(np.array([0.0, duration]))
-            rows = np.concatenate([self._values(segment, t) for t in parts], axis=1)
-            self._samples.append(rows)
-            if segment == 0:
-                self._low, self._high = np.full(len(rows), np.inf), np.full(len(rows), -np.inf)
-            self._keep_best(segment, np.concatenate(parts), rows)
-            self._low, self._high = np.minimum(self._low, rows.min(axis=1)), np.maximum(self._high, rows.max(axis=1))
+        shares = np.maximum(self._durations / plan.duration, 1.0 / self._durations.size)
+        counts = 2 ** np.ceil(np.log2(np.maximum(_SAMPLES * shares, 64.0))).astype(int)
+        self.samples = [self._sampled(np.flatnonzero(counts == count), count) for count in np.unique(counts).tolist()]
 
-    def bisect(self, segment: int) -> None:
-        """Add the candidate times of a segment to the results."""
-        index = np.zeros(1, dtype=np.int64)
+    def _sampled(self, segments: NDArray[np.intp], count: int) -> _Samples:
+        """Samples of segments, whose ends are evaluated as well."""
+        durations = self._durations[segments, None]
+        times = np.concatenate([durations * _between(count), 0.0 * durations, durations], axis=1)
+        every, t = np.repeat(segments, count + 2), times.ravel()
+        chunks = -(-t.size // 4096)  # fit into the cache
+        pairs = zip(np.array_split(every, chunks), np.array_split(t, chunks), strict=True)
+        rows = np.concatenate([self._values(*pair) for pair in pairs], axis=1)
+        self._keep_best(every, t, rows)
+        self._low, self._high = np.minimum(self._low, rows.min(axis=1)), np.maximum(self._high, rows.max(axis=1))
+        return _Samples(segments, count, rows.reshape(len(rows), segments.size, -1)[..., :-2])
+
+    def bisect(self, samples: _Samples) -> None:
+        """Add the candidate times of segments to the results."""
+        place = np.arange(samples.segments.size)
+        index = np.zeros(place.size, dtype=np.int64)
         level = 0
         while index.size:
             self._spent += index.size
-            parts = [self._pieces(segment, level, index[k : k + _CHUNK]) for k in range(0, index.size, _CHUNK)]
+            chunks = [slice(k, k + _CHUNK) for k in range(0, index.size, _CHUNK)]
+            parts = [self._pieces(samples, level, place[chunk], index[chunk]) for chunk in chunks]
             again = np.concatenate([split for split, _ in parts])
-            if again.size and self._spent + 2 * again.size > _MAX_PIECES:
-                self._raise_unresolved(segment, level, again, max(rest for _, rest in parts))
-            index = (2 * again[:, None] + np.arange(2)).ravel()
+            if again.any() and self._spent + 2 * int(again.sum()) > _MAX_PIECES:
+                own = samples.segments[place[again]]
+                first = own == own[0]
+                self._raise_unresolved(int(own[0]), level, index[again][first], max(rest for _, rest in parts))
+            place = np.repeat(place[again], 2)
+            index = (2 * index[again, None] + np.arange(2)).ravel()
             level += 1
 
-    def _pieces(self, segment: int, level: int, index: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
-        """Pieces of a level that must be bisected, and the maximum unresolved error."""
-        duration, samples = self.segments[segment][1], self._samples[segment][:, :-2]
-        width, count = math.ldexp(duration, -level), samples.shape[1] >> level
+    def _pieces(
+        self, samples: _Samples, level: int, place: NDArray[np.intp], index: NDArray[np.int64]
+    ) -> tuple[NDArray[np.bool_], float]:
+        """Which pieces of a level, of segments at places in `samples`, must be bisected; maximum unresolved error."""
+        segments, count = samples.segments[place], samples.count >> level
+        durations = self._durations[segments]
+        widths = np.ldexp(durations, -level)
         own = _SHARES if count >= _CHECKS else np.append(_SHARES, _between(_CHECKS))
-        times = np.minimum(width * (index[:, None] + own), duration)
-        found = self._values(segment, times.ravel())
-        self._keep_best(segment, times.ravel(), found)
-        values = found.reshape(len(samples), *times.shape)
+        times = np.minimum(widths[:, None] * (index[:, None] + own), durations[:, None])
+        every = np.repeat(segments, own.size)
+        found = self._values(every, times.ravel())
+        self._keep_best(every, times.ravel(), found)
+        values = found.reshape(len(found), *times.shape)
         series = transform(values[..., : _FIT + 1])
         missed = np.abs(series @ _ENDS - values[..., _FIT + 1 : _FIT + 3]).max(axis=2)
         missed = np.maximum(missed, np.abs(series[..., -8:]).max(axis=2))
@@ -295,15 +328,16 @@ class _Search:
         if checks.size:
             missed = np.maximum(missed, np.abs(series @ _basis(_CHECKS) - checks).max(axis=2))
         if count:  # samples of the piece, which may show features that its check points miss
-            seen = samples.reshape(len(samples), -1, count)[:, index]
+            seen = samples.values.reshape(*samples.values.shape[:2], -1, count)[:, place, index]
             missed = np.maximum(missed, np.abs(series @ _basis(count) - seen).max(axis=2))
             checks = np.concatenate([checks, seen], axis=2)
 
         low = np.minimum(values.min(axis=2), checks.min(axis=2))
         high = np.maximum(values.max(axis=2), checks.max(axis=2))
-        for (row, _), (place, instant, value) in self._best.items():  # a piece too short for a sample
-            k = int(np.searchsorted(index, math.floor(instant / width)))
-            if place == segment and k < index.size and 0.0 <= (part := instant / width - index[k]) <= 1.0:
+        for (row, _), (segment, instant, value) in self._best.items():  # a piece too short for a sample
+            (near,) = np.nonzero((segments == segment) & (index >= np.floor(instant / widths)))
+            k = int(near[0]) if near.size else -1
+            if k >= 0 and 0.0 <= (part := instant / widths[k] - index[k]) <= 1.0:
                 miss = abs(float(chebyshev.chebval(2.0 * part - 1.0, series[row, k])) - value)
                 missed[row, k] = max(missed[row, k], miss)
                 low[row, k], high[row, k] = min(low[row, k], value), max(high[row, k], value)
@@ -317,43 +351,63 @@ class _Search:
         rest = missed / scale
         smooth = rest <= 0.1 * TOLERANCE
         flat = high - low <= 0.1 * TOLERANCE * scale
-        short = width <= 4.0 * np.finfo(float).eps * duration
+        short = level >= _DEEPEST
         split = (matters & ~(smooth | flat | short)).any(axis=0)
-        for piece in np.flatnonzero(matters.any(axis=0) & ~split).tolist():
-            t = [times[piece, _FIT + 1 : _FIT + 3]]
-            for row in np.flatnonzero(matters[:, piece]).tolist():
-                roots = real_roots(_slope(series[row, piece])) if smooth[row, piece] else 2.0 * own - 1.0
-                t.append(np.minimum(width * (index[piece] + 0.5 * (1.0 + roots)), duration))
-            self._add(segment, np.concatenate(t))
-        return index[split], float(rest[:, split].max(initial=0.0))
+        self._add(segments, times, series, matters & ~split, smooth)
+        return split, float(rest[:, split].max(initial=0.0))
 
-    def _add(self, segment: int, t: Array) -> None:
-        times, ends = _placed(self._plan, segment, t)
-        self.found.add(times, self._values(segment, t), ends)
+    def _add(
+        self,
+        segments: NDArray[np.intp],
+        times: Array,
+        series: Array,
+        chosen: NDArray[np.bool_],
+        smooth: NDArray[np.bool_],
+    ) -> None:
+        """Add the candidates of pieces, at `times`, for the rows `chosen`: their ends and the roots of the slopes."""
+        pieces = np.flatnonzero(chosen.any(axis=0))
+        rows, of_smooth = np.nonzero(chosen & smooth)
+        which, roots = roots_of_rows(_slopes(series[rows, of_smooth]))
+        at_roots = of_smooth[which]
+        first, last = times[:, _FIT + 1], times[:, _FIT + 2]
+        whole = np.flatnonzero((chosen & ~smooth).any(axis=0))
+        every = np.concatenate([pieces, pieces, at_roots, np.repeat(whole, times.shape[1])])
+        inner = first[at_roots] + 0.5 * (1.0 + roots) * (last - first)[at_roots]
+        t = np.concatenate([first[pieces], last[pieces], inner, times[whole].ravel()])
+        if t.size:
+            self._add_at(segments[every], t, self._values(segments[every], t))
 
-    def _keep_best(self, segment: int, t: Array, values: Array) -> None:
+    def _add_at(self, segments: NDArray[np.intp], t: Array, values: Array) -> None:
+        """Add values (nrows, ntime) at times from the beginnings of segments."""
+        left, right = self._plan.breakpoints[segments], self._plan.breakpoints[segments + 1]
+        times = np.where(t < right - left, np.minimum(left + t, np.nextafter(right, left)), right)
+        self.found.add(times, values, (left, right))
+
+    def _keep_best(self, segments: NDArray[np.intp], t: Array, values: Array) -> None:
         """Add times at which a row exceeds all previous values as candidates: the roots nearby may not reach it."""
         for sign, seen in ((-1.0, self._low), (1.0, self._high)):
             best = (sign * values).argmax(axis=1)
             for row in np.flatnonzero((sign * values).max(axis=1) > sign * seen).tolist():
                 at = best[row : row + 1]
-                self._best[row, sign] = (segment, float(t[at[0]]), float(values[row, at[0]]))
-                times, ends = _placed(self._plan, segment, t[at])
-                self.found.add(times, values[:, at], ends)
+                self._best[row, sign] = (int(segments[at[0]]), float(t[at[0]]), float(values[row, at[0]]))
+                self._add_at(segments[at], t[at], values[:, at])
 
-    def _values(self, segment: int, t: Array) -> Array:
-        """Values (nrows, ntime) of the function at times from the beginning of a segment."""
-        values = np.atleast_2d(np.asarray(self._function(self._plan.segment_jet(segment, t, self._order)), dtype=float))
+    def _values(self, segments: NDArray[np.intp], t: Array) -> Array:
+        """Values (nrows, ntime) of the function at times from the beginnings of segments."""
+        one = self._durations.size == 1
+        jet = self._plan.segment_jet(0, t, self._order) if one else self._plan.segments_jet(segments, t, self._order)
+        values = np.atleast_2d(np.asarray(self._function(jet), dtype=float))
         if values.ndim != 2 or values.shape[1] != t.size:
             raise ValueError(f"function must return values of shape (ntime,) or (m, ntime), got shape {values.shape}")
         if not np.isfinite(values).all():
-            (origin, duration), bad = self.segments[segment], t[~np.isfinite(values).all(axis=0)]
-            where = f"between {origin:g} and {origin + duration:g} s, such as at {origin + bad[0]:g} s"
+            bad = int((~np.isfinite(values).all(axis=0)).argmax())
+            origin, duration = self._starts[segments[bad]], self._durations[segments[bad]]
+            where = f"between {origin:g} and {origin + duration:g} s, such as at {origin + t[bad]:g} s"
             raise ValueError(f"function must be finite over the plan, got nan or inf {where}")
         return values
 
     def _raise_unresolved(self, segment: int, level: int, index: NDArray[np.int64], rest: float) -> NoReturn:
-        origin, duration = self.segments[segment]
+        origin, duration = float(self._starts[segment]), float(self._durations[segment])
         left, right = (origin + math.ldexp(duration, -level) * (k + i) for i, k in enumerate((index[0], index[-1])))
         raise RuntimeError(
             f"function must be resolved to {TOLERANCE:g} of its largest magnitude, got {rest:.2g} "
@@ -371,19 +425,19 @@ def certified_bounds(
     max_cells: int,
 ) -> Bounds:
     """Bounds by refinement of cells until the Lipschitz bound reaches the tolerance."""
-    segments = _searchable_segments(plan)
+    durations = _searchable_segments(plan)[1].tolist()
     weights = _weights(lipschitz, order + 1, plan.naxes)
     if not rtol > 0.0:
         raise ValueError(f"rtol must be above 0, got {rtol}")
     first, second = (np.stack([plan.peak(k + nu) for k in range(order + 1)])[:, :, None] for nu in (1, 2))
     found, lower, upper = _Candidates(), np.inf, -np.inf
     minimum, maximum = np.inf, -np.inf
-    for segment, (_, duration) in enumerate(segments):
+    for segment, duration in enumerate(durations):
         s = np.linspace(0.0, duration, 129)
         values = _evaluated(function, plan.segment_jet(segment, s, order))
         found.add(_placed(plan, segment, s)[0], values[None])
         minimum, maximum = min(minimum, float(values.min())), max(maximum, float(values.max()))
-    for segment, (_, duration) in enumerate(segments):
+    for segment, duration in enumerate(durations):
         radius, spent = duration / 256, 0
         centres = duration * (np.arange(128) + 0.5) / 128
         while centres.size:
@@ -438,10 +492,12 @@ def _evaluated(function: Callable[[Array], Array], jet: Array) -> Array:
     return values
 
 
-def _slope(series: Array) -> Array:
-    """Derivative of a Chebyshev series without the terms that are rounding, which would only slow down its roots."""
-    size = np.abs(series) * np.arange(series.size) ** 2
-    return np.asarray(chebyshev.chebder(series[: int(np.flatnonzero(size >= 1e-12 * size.max()).max(initial=1)) + 1]))
+def _slopes(series: Array) -> Array:
+    """Derivatives of Chebyshev series (nrows, size) without the terms that are rounding, which only slow down roots."""
+    size = np.abs(series) * np.arange(series.shape[1]) ** 2
+    matters = size >= 1e-12 * size.max(axis=1, keepdims=True)
+    highest = series.shape[1] - 1 - matters[:, ::-1].argmax(axis=1)
+    return np.asarray(chebyshev.chebder(np.where(np.arange(series.shape[1]) <= highest[:, None], series, 0.0), axis=1))
 
 
 _SHARES = readonly(np.append(points(_FIT, 0.0, 1.0), [0.0, 1.0]))
@@ -496,11 +552,6 @@ class _Candidates:
         return np.argmax(tied * (1.0 + ends), axis=1)
 
 
-def _segments(plan: Trajectory) -> list[tuple[float, float]]:
-    """Start and duration [s] of each segment."""
-    return list(zip(plan.breakpoints[:-1].tolist(), np.diff(plan.breakpoints).tolist(), strict=True))
-
-
 def _placed(plan: Trajectory, segment: int, t: Array) -> tuple[Array, tuple[float, float]]:
     """Times of a plan from those of a segment, clipped to the ends of the segment, and these ends."""
     left, right = plan.breakpoints[segment : segment + 2].tolist()
@@ -508,11 +559,11 @@ def _placed(plan: Trajectory, segment: int, t: Array) -> tuple[Array, tuple[floa
     return times, (left, right)
 
 
-def _searchable_segments(plan: Trajectory) -> list[tuple[float, float]]:
-    segments = _segments(plan)
-    if not segments:
+def _searchable_segments(plan: Trajectory) -> tuple[Array, Array]:
+    """Starts and durations [s] (nsegments,) of the segments."""
+    if plan.breakpoints.size < 2:
         raise ValueError("a trajectory must have a duration to be searched for extrema, got a step")
-    return segments
+    return plan.breakpoints[:-1], np.diff(plan.breakpoints)
 
 
 def _pieces(

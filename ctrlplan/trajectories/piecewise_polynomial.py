@@ -130,15 +130,20 @@ class PiecewisePolynomial(Trajectory):
         if not left:
             segments[t == self.breakpoints[-1]] = last
         touched = int(np.count_nonzero(np.diff(segments))) + 1
-        inside = t.size and segments.min() >= 0 and segments.max() <= last
-        if touched <= _FEW or t.size > _MANY * touched or not inside:
+        if touched <= _FEW or t.size > _MANY * touched:
             return super()._sample(t, low, high, left)
+        before, after = segments < 0, segments > last
         out = np.empty((high - low + 1, self.naxes, t.size))
         with np.errstate(over="ignore", invalid="ignore"):
             for begin in range(0, t.size, _CHUNK):
                 part = slice(begin, begin + _CHUNK)
-                own = segments[part]
+                own = np.clip(segments[part], 0, last)
                 out[:, :, part] = self.segments_jet(own, t[part] - self.breakpoints[own], high)[low:]
+        for outside, held in ((before, self.initial), (after, self.final)):
+            if outside.any():
+                out[:, :, outside] = 0.0
+                if low == 0:
+                    out[0][:, outside] = held[:, None]
         return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
     def stationary_places(self, nu: int) -> tuple[NDArray[np.intp], Array] | None:

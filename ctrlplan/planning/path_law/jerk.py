@@ -27,11 +27,14 @@ from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 _ROUNDS, _GAIN = 25, 1e-3
 """Maximum number of problems on a grid, and the decrease of the duration, relative to it, that ends them."""
 
-_LOSS, _REFINEMENTS, _PIECES = 2e-2, 2, 3
+_LOSS, _REFINEMENTS, _PIECES = 5e-3, 2, 3
 """As for limits of the acceleration; signals are at no limit while the jerk changes its sign."""
 
 _START = 0.8
 """Squared rate of the start relative to the largest constant one."""
+
+INSIDE = 0.95
+"""Start of each problem relative to the last solution, which is at its limits."""
 
 _NODES, _WEIGHTS = (readonly(0.5 * own) for own in np.polynomial.legendre.leggauss(24) + np.array([[1.0], [0.0]]))
 """Quadrature of the duration of a cell."""
@@ -54,9 +57,9 @@ def fastest_smooth_law(plan: Trajectory, bounds: Sequence[Bound], start: float) 
     parts = parts_of(plan, True, [time - start + plan.start for bound in bounds for time in changes(bound)])
     grid = Grid.of(plan, [part for part in parts if part.moves])
     spline, activity = Spline.quartic(grid), Activity.of(grid, bounds, SMOOTH_POINTS, start)
-    x = np.full(spline.size, _START * _constant(grid, activity))
+    x, duration = np.full(spline.size, _START * _constant(grid, activity)), np.inf
     for refinement in range(_REFINEMENTS + 1):
-        local = _converged(grid, spline, activity, x)
+        local, duration = _converged(grid, spline, activity, x, duration)
         loss = losses(activity, local, grid.length)
         if loss.sum() < _LOSS or refinement == _REFINEMENTS:
             break
@@ -77,17 +80,19 @@ def _constant(grid: Grid, activity: Activity) -> float:
     return 1.0 / max(speeds, others if others > speeds**0.5 else 0.0, (jerks if jerks > others else 0.0) ** (2.0 / 3.0))
 
 
-def _converged(grid: Grid, spline: Spline, activity: Activity, x: Array) -> Array:
-    """Bernstein coefficients (degree + 1, ncells) of a local minimum."""
-    last = np.inf
+def _converged(grid: Grid, spline: Spline, activity: Activity, x: Array, last: float) -> tuple[Array, float]:
+    """Bernstein coefficients (degree + 1, ncells) of a local minimum, and its duration.
+
+    The decreases of the duration vanish faster than their power 3/2.
+    """
     for _ in range(_ROUNDS):
         problem = problem_of(grid, spline, activity.rows(grid.length, spline.coefficients(x)))
-        x = minimum(problem, x)
+        x = minimum(problem, INSIDE * x)
         duration = problem.duration(x)
-        if duration > (1.0 - _GAIN) * last:
+        gain, last = 1.0 - duration / last, duration
+        if gain < _GAIN ** (2.0 / 3.0):
             break
-        last = duration
-    return spline.coefficients(x)
+    return spline.coefficients(x), last
 
 
 def on_pieces(local: Array, counts: NDArray[np.intp]) -> Array:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.optimize import brentq
 
 from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid, Spline
@@ -34,10 +35,16 @@ _POINTS: Array = np.asarray(0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 10)), dty
 _ROUNDS, _GAIN = 30, 5e-4
 """Maximum number of problems, and the decrease of the duration, relative to it, that ends them."""
 
+_NEAR, _WORSE = 0.5, 0.05
+"""Solutions are linearised about that need to be slowed down in b, or in their duration, by no more than that."""
+
+_SETTLED = 1.2
+"""Trust region with which a solution that does not change is a local minimum."""
+
 _START = 0.95
 """Squared rate of the start relative to the largest constant one."""
 
-_STEP = 1e-5
+_STEP = 1e-6
 """Step of the differences by which signals are linearised, relative to the size of b."""
 
 _RESERVE = 1e-4
@@ -52,6 +59,12 @@ _INFEASIBLE = 0.05
 _CHECKS: Array = np.asarray((np.arange(24) + 0.5) / 24.0, dtype=float)
 """Points at which that is evaluated."""
 
+_SLOWEST = 1e-12
+"""Smallest multiple of a squared rate that is tried, and reciprocal of the largest one."""
+
+_SCALE, _BEYOND = 1e-4, 10.0
+"""Resolution of multiples of b, and the violation attributed to one that is infeasible for the plant."""
+
 _FAR = 1e6
 """Magnitude of a missing limit, in the scale of the other one."""
 
@@ -59,25 +72,31 @@ HIGHEST = 4
 """Highest derivative of the plan on which signals may depend: the law has four continuous ones."""
 
 
-def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory:
+def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory | None:
     """Plan with a fast time law; limits may be slightly violated between points of the cells.
 
     Parameters
     ----------
     plan : Trajectory
-        Plan that satisfies the limits.
+        Plan with a duration.
     limited : Limited
         The limits, of signals that depend on at most `HIGHEST` derivatives.
+
+    Returns
+    -------
+    Trajectory, or None
+        None if no multiple of the plan's rate satisfies the limits, or every one, or if
+        no other rate makes it shorter.
     """
     parts = parts_of(plan, True)
     grid = Grid.of(plan, [part for part in parts if part.moves])
     spline = Spline.quartic(grid)
     signals, between = _Signals(grid, limited, _POINTS), _Signals(grid, limited, _CHECKS)
-    x = np.full(spline.size, _START)
-    scale = signals.feasible_scale(spline.coefficients(x))
-    if not scale:  # no slower plan satisfies the limits with a reserve
-        return plan
-    x = scale * x
+    x = np.full(spline.size, 1.0)
+    scale = signals.feasible_scale(spline.coefficients(x), 1.0 / _SLOWEST)
+    if not 0.0 < scale < 1.0 / _SLOWEST:
+        return None
+    x = _START * scale * x
     reserve = np.full(grid.length.size, _RESERVE)
     for _ in range(_TIGHTENINGS + 1):
         x = _converged(grid, spline, signals, x, reserve)
@@ -85,29 +104,32 @@ def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory:
         if excess.max() < _BETWEEN:
             break
         reserve += 1.5 * np.maximum(excess, 0.0)
-    return Retimed(plan, smooth_law(plan, parts, grid, spline.coefficients(x)))
+    law = smooth_law(plan, parts, grid, spline.coefficients(x))
+    return Retimed(plan, law) if law.duration < (1.0 - _RESERVE) * plan.duration / scale**0.5 else None
 
 
 def _converged(grid: Grid, spline: Spline, signals: _Signals, x: Array, reserve: Array) -> Array:
     """Coefficients near a local minimum, with a distance (ncells,) from the limits in each cell."""
-    duration, trust = np.inf, 2.0
+    best, duration, trust = x, np.inf, 2.0
     for _ in range(_ROUNDS):
-        problem = replace(problem_of(grid, spline, signals.rows(spline.coefficients(x), reserve)), trust=trust)
         try:
+            problem = replace(problem_of(grid, spline, signals.rows(spline.coefficients(x), reserve)), trust=trust)
             tried = minimum(problem, x)
         except ValueError:  # the linearised limits cannot be satisfied near this solution
-            trust = trust**0.4
+            x, trust = best, trust**0.4
             if trust < 1.001:
                 break
             continue
         scale = signals.feasible_scale(spline.coefficients(tried))
+        promised = 1.0 - problem.duration(tried) / duration
         gain = 1.0 - problem.duration(scale * tried) / duration
         if gain > 0.0:
-            x, duration = scale * tried, problem.duration(scale * tried)
-        if (scale > 1.0 - _GAIN and gain < _GAIN) or trust < 1.001:
+            best, duration = scale * tried, problem.duration(scale * tried)
+        if (scale > 1.0 - _GAIN and abs(gain) < _GAIN and trust > _SETTLED) or trust < 1.001:
             break
-        trust = min(1.5 * trust, 4.0) if gain > 0.0 else trust**0.4
-    return x
+        x = tried if scale > _NEAR and gain > -_WORSE else best
+        trust = min(2.0 * trust, 4.0) if gain > 0.75 * promised else trust if gain > 0.25 * promised else trust**0.5
+    return best
 
 
 class _Signals:
@@ -129,16 +151,26 @@ class _Signals:
         self._low = np.maximum(low / self._scales, -_FAR) - slack
         self._high = np.minimum(high / self._scales, _FAR) + slack
 
-    def feasible_scale(self, local: Array) -> float:
-        """Largest multiple of a squared rate, up to 1, that satisfies the limits at the points."""
+    def feasible_scale(self, local: Array, largest: float = 1.0) -> float:
+        """Largest multiple of a squared rate that satisfies the limits at the points, to `_SCALE`; 0 for none."""
         derivatives = self._derivatives(local)
-        low, high = 0.0, 1.0
-        if self._satisfies(derivatives):
-            return 1.0
-        for _ in range(30):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self._satisfies(middle * derivatives) else (low, middle)
-        return low
+
+        def beyond(scale: float) -> float:
+            return self._beyond(scale * derivatives)
+
+        low = high = 1.0
+        while high < largest and beyond(high) <= 0.0:
+            low, high = high, 4.0 * high
+        if high >= largest and beyond(largest) <= 0.0:
+            return largest
+        while beyond(low) > 0.0:
+            low, high = 0.25 * low, low
+            if low < _SLOWEST:
+                return 0.0
+        scale = float(brentq(beyond, low, high, xtol=_SCALE * low, rtol=_SCALE))
+        while beyond(scale) > 0.0:
+            scale *= 1.0 - 2.0 * _SCALE
+        return scale
 
     def excess(self, local: Array) -> Array:
         """Maximum violation in each cell (ncells,), in the scale of the limits."""
@@ -151,50 +183,47 @@ class _Signals:
 
     def rows(self, local: Array, reserve: Array) -> Rows:
         """Inequalities of the linearised signals for the Bernstein coefficients of the cells."""
-        derivatives = self._derivatives(local)
-        size = np.abs(derivatives[0])
-        steps = [_STEP * size / self._grid.length.repeat(self._points.size) ** nu for nu in range(4)]
-        values, slopes = self._values(derivatives), []
-        for nu, step in enumerate(steps):
-            ahead, behind = derivatives.copy(), derivatives.copy()
-            ahead[nu] += step
-            behind[nu] -= step
-            slopes.append((self._values(ahead) - self._values(behind)) / (2.0 * step))
-        constant = values - sum(slope * own for slope, own in zip(slopes, derivatives, strict=True))
-        shape = (len(values), self._grid.length.size, self._points.size)
+        derivatives, length = self._derivatives(local), self._grid.length
+        steps = _STEP * np.abs(derivatives[0]) / length.repeat(self._points.size) ** np.arange(self._order)[:, None]
+        moved = np.repeat(derivatives[:, None], self._order + 1, axis=1)
+        moved[np.arange(self._order), np.arange(1, self._order + 1)] += steps
+        values, *ahead = self._values(moved).swapaxes(0, 1)
+        slopes = (np.stack(ahead) - values) / steps[:, None]
+        constant = values - (slopes * derivatives[:, None]).sum(axis=0)
+        shape = (len(values), length.size, self._points.size)
         factors = sum(
-            slope.reshape(shape)[..., None]
-            * bernstein(self._points, len(local) - 1, nu)
-            / self._grid.length[:, None, None] ** nu
+            slope.reshape(shape)[..., None] * bernstein(self._points, len(local) - 1, nu) / length[:, None, None] ** nu
             for nu, slope in enumerate(slopes)
         )
         order = (0, 2, 1)
         upper, lower = (
-            ((side - constant).reshape(shape) - sign * reserve[:, None])
-            .transpose(order)
-            .reshape(-1, self._grid.length.size)
+            ((side - constant).reshape(shape) - sign * reserve[:, None]).transpose(order).reshape(-1, length.size)
             for side, sign in ((self._high, 1.0), (self._low, -1.0))
         )
-        rows = np.asarray(factors).transpose(0, 2, 1, 3).reshape(len(upper), self._grid.length.size, -1)
+        rows = np.asarray(factors).transpose(0, 2, 1, 3).reshape(len(upper), length.size, -1)
         return Rows(rows, upper, lower)
 
     def _derivatives(self, local: Array) -> Array:
-        """B and its derivatives (4, npoints) at the points of all cells, by Bernstein coefficients."""
+        """B and its derivatives (order, npoints) at the points of all cells, by Bernstein coefficients."""
         degree, h = len(local) - 1, self._grid.length
-        found = [(bernstein(self._points, degree, nu) @ local / h**nu).T.ravel() for nu in range(4)]
+        found = [(bernstein(self._points, degree, nu) @ local / h**nu).T.ravel() for nu in range(self._order)]
         return np.stack(found)
 
     def _values(self, derivatives: Array) -> Array:
-        """Signals (nbounds, npoints) in the scale of their limits."""
-        b, slope, bend, third = derivatives
+        """Signals (nbounds, ..., npoints) in the scale of their limits, by derivatives (order, ..., npoints) of b."""
+        b, slope, bend, third, *_ = (*derivatives, *np.zeros(3))
         rate = np.sqrt(np.maximum(b, 1e-300))
         series = [rate, slope / 4.0, bend * rate / 12.0, (third * b + 0.5 * bend * slope) / 48.0][: self._order]
-        jet = np.stack(composed(self._path, series)) * FACTORIALS[: self._order + 1, None, None]
-        return self._limited.values(jet)[self._moving] / self._scales
+        shape = derivatives.shape[1:]
+        path = [row.reshape(len(row), *np.ones(len(shape) - 1, dtype=int), -1) for row in self._path]
+        rows = [np.broadcast_to(row, (len(row), *shape)) for row in composed(path, series)]
+        jet = np.stack(rows).reshape(len(rows), len(path[0]), -1) * FACTORIALS[: self._order + 1, None, None]
+        return (self._limited.values(jet)[self._moving] / self._scales).reshape(-1, *shape)
 
-    def _satisfies(self, derivatives: Array) -> bool:
+    def _beyond(self, derivatives: Array) -> float:
+        """Maximum violation with half the reserve, in the scale of the limits, up to `_BEYOND`."""
         try:
             values = self._values(derivatives)
         except ValueError:  # infeasible for the plant
-            return False
-        return bool(((values <= self._high - 0.5 * _RESERVE) & (values >= self._low + 0.5 * _RESERVE)).all())
+            return _BEYOND
+        return min(float(np.maximum(values - self._high, self._low - values).max()) + 0.5 * _RESERVE, _BEYOND)
