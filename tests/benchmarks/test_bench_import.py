@@ -1,4 +1,4 @@
-"""CPU time of importing the package for one spline, next to what it would be used with; the ratio is printed."""
+"""CPU time of importing the package, next to what it would be used with; ratios are printed."""
 
 import resource
 import subprocess
@@ -31,3 +31,20 @@ def test_import_next_to_scipy_and_control(benchmark, capsys):
         print(
             f"\nimport: {1e3 * own:.0f} ms, scipy.interpolate and control {1e3 * peer:.0f} ms, ratio {own / peer:.2f}"
         )
+
+
+@pytest.mark.benchmark
+def test_import_of_the_simulation(benchmark, capsys):
+    """Goal: at most 1.05. In one process, since the time of python-control alone varies by more."""
+    parts = "from time import process_time as t; a = t(); import control; b = t(); import ctrlplan.simulation; c = t()"
+    loaded = "import sys; assert 'scipy.io' not in sys.modules"
+    subprocess.run([sys.executable, "-c", f"{parts}; {loaded}"], check=True)
+    rows = []
+    for _ in range(5):
+        found = subprocess.run([sys.executable, "-c", f"{parts}; print(b - a, c - a)"], check=True, capture_output=True)
+        rows.append([float(number) for number in found.stdout.split()])
+    peer, own = (min(column) for column in zip(*rows, strict=True))
+    benchmark.extra_info["ratio"] = own / peer
+    benchmark.pedantic(lambda: seconds("import ctrlplan.simulation"), rounds=1)
+    with capsys.disabled():
+        print(f"\nctrlplan.simulation: {1e3 * own:.0f} ms, import control {1e3 * peer:.0f} ms, ratio {own / peer:.3f}")

@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 import re
 
-from scipy.io import savemat
-
 from ctrlplan.trajectories.export.formats import SampledTable, TableFormat
 
 
@@ -20,6 +18,8 @@ class MAT(TableFormat):
 
     def encoded(self, table: SampledTable) -> bytes:
         """Content of the file; as `TableFormat.encoded`."""
+        from scipy.io import savemat  # it adds a twentieth to the import of the package
+
         time = table.times[:, None]
         variables: dict[str, object] = {"time": time}
         for name, row in zip(table.names, table.rows, strict=True):
