@@ -18,7 +18,7 @@ from ctrlplan.symbolic.trials import can_remember
 from ctrlplan.traits import BlockFunction
 
 _EVENT_TIMES = 400, 20_000
-"""Minimum and maximum number of times, in addition to the sample times, at which signals of events are evaluated."""
+"""Minimum and maximum number of evenly spaced times of a run, no farther apart than which are those of events."""
 
 _EVENT_TIMES_A_PERIOD = 16
 """Number of such times per period of the fastest oscillation about the initial state."""
@@ -126,14 +126,25 @@ class Record:
 
 
 def with_event_times(times: Array, watched: Sequence[Watched], slope: Callable[[], Array]) -> Array:
-    """Sample times, with further ones if there are events, so that crossings between samples are detected."""
+    """Sample times, with further ones if there are events, so that crossings between samples are detected.
+
+    Intervals that are too long are divided evenly, so that equal intervals have equal times: a compiled solver is
+    built for each pattern of times.
+    """
     if not watched:
         return times
     matrix = slope()
     fastest = float(np.abs(np.linalg.eigvals(matrix).imag).max(initial=0.0)) if np.isfinite(matrix).all() else 0.0
     periods = fastest * float(times[-1] - times[0]) / (2.0 * np.pi)
     count = int(min(max(_EVENT_TIMES[0], _EVENT_TIMES_A_PERIOD * periods), _EVENT_TIMES[1]))
-    return np.union1d(times, np.linspace(times[0], times[-1], count))
+    gaps = np.diff(times)
+    parts = np.ceil(gaps * ((count - 1) / (times[-1] - times[0])) * (1.0 - 1e-9)).astype(int)
+    if parts.max() == 1:
+        return times
+    within = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    inner = np.repeat(times[:-1], parts) + np.repeat(gaps / parts, parts) * within
+    inner[within == 0] = times[:-1]
+    return np.append(inner, times[-1])
 
 
 def _of_block(

@@ -356,9 +356,11 @@ class Attempt(Generic[S]):
         found: Array = self.solver.advance(self.run.series(start), start, np.array([t]), self.run.states[:, k])
         return found[:, -1]
 
-    def _stops_after(self, t: Array, x: Array) -> bool:
+    def _stops_after(self, t: Array, x: Array) -> int | None:
+        """Index of the first time, after the start of a segment, by which an event that ends the run has occurred."""
         seen = self._snapshot(t, x)
-        return any(entry.side(entry.value(seen)).any() for entry in self.watched if entry.stop)
+        beyond = np.any([entry.side(entry.value(seen)) != 0 for entry in self.watched if entry.stop], axis=0)
+        return max(1, int(beyond.argmax())) if beyond.any() else None
 
     def _initial_slope(self) -> Array:
         """Jacobian by the states at the start of the run; nan where blocks raise."""

@@ -58,6 +58,9 @@ _ROUNDINGS = 64.0
 _SEGMENTS = 2_000
 """Maximum number of segments that the declared `longest` step of blocks may cause."""
 
+_FIRST, _LATER = 32.0, 8.0
+"""Length of the first segment, and maximum length of others, as fractions of a run that an event may end."""
+
 _MARKS = 20_000
 """Maximum number of times of jumps at which a run stops."""
 
@@ -170,7 +173,7 @@ def integrate(
     state: Array,
     resolution: float,
     marks: Sequence[float] = (),
-    stops_after: Callable[[Array, Array], bool] | None = None,
+    stops_after: Callable[[Array, Array], int | None] | None = None,
     course: Course | None = None,
 ) -> NetworkRun:
     """Run a network over increasing times.
@@ -190,8 +193,8 @@ def integrate(
     marks : sequence of float, optional
         Further times [s] at which equations switch.
     stops_after : callable, optional
-        Maps the times and states of a segment to whether the run may end after
-        it; segments are then short.
+        Maps the times and states of a segment to the index of the time at which
+        the run may end, None for none of them; segments are then shorter.
     course : Course, optional
         Former runs that this one continues. Samples that are due at its end
         belong to the next run.
@@ -208,15 +211,18 @@ def integrate(
     else:
         course.prolong(apart([first, *marks, last])[1:-1], first, last)
     memory, schedule, rounding = course.memory, course.schedule, course.rounding
-    shortest, longest = _lengths(network, memory.delays, last - first, stops_after is not None)
+    shortest, reach, longest = _lengths(network, memory.delays, last - first, stops_after is not None)
     known: list[tuple[Array, Array]] = []  # times and states of each segment, without its end
     segments, span = list[tuple[float, Series]](), list[Series]()
-    left, reach = first, longest
+    left = first
     x = schedule.sample(equations, first, state)
     while left < last:
         check(left)  # CVODES is not interrupted within a segment, which has a maximum number of steps
         right = schedule.following(left)
-        right = schedule.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
+        if right - left <= reach * (1.0 + 1e-9):
+            right = schedule.on(times, right)
+        else:
+            right = left + reach if stops_after is None else _reached(times, left, reach)
         if memory.delays or not (span and span[-1].right >= right):
             until, accuracy = (right, resolution) if memory.delays else (schedule.fixed_after(left), RESOLVED)
             error = np.maximum(rounding, memory.rounding)
@@ -226,14 +232,12 @@ def integrate(
         inside = times[slice(*np.searchsorted(times, [left, right]))]
         grid = np.union1d(np.append(memory.nodes(left, right), right), inside[inside > left])
         try:
-            found = solver.advance(series, left, grid, x)
+            found = _advanced(solver, series, left, grid, x, last)
         except SolverError:
             if right - left < shortest:
                 raise
             reach = 0.5 * (right - left)
             continue
-        if not np.isfinite(found).all():
-            raise SolverError(f"the solver must reach {last:g} s, got to {left:g} s: a state is not finite after that")
         if not memory.record(left, right, series, grid, found):
             reach = 0.5 * (right - left)
             continue
@@ -244,9 +248,15 @@ def integrate(
         before, x = x, found[:, -1]
         if ends or right < last:
             x = schedule.sample(equations, right, x)
+        if stops_after is not None:
+            grid, found = np.append(left, grid), np.column_stack([before, found])
+            stop = stops_after(grid, found)
+            if stop is not None:  # what follows is not part of the run
+                before_stop = known[-1][0] < grid[stop]
+                known[-1] = known[-1][0][before_stop], known[-1][1][:, before_stop]
+                left, x = float(grid[stop]), found[:, stop] if stop < grid.size - 1 else x
+                break
         left, reach = right, min(longest, 2.0 * reach)
-        if stops_after is not None and stops_after(np.append(segments[-1][0], grid), np.column_stack([before, found])):
-            break
     known.append((np.array([left]), x[:, None]))
     return NetworkRun(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), segments)
 
@@ -315,10 +325,32 @@ def _new_course(
     return course
 
 
-def _lengths(network: Network, delays: list[float], duration: float, stops: bool) -> tuple[float, float]:
-    """Length [s] below which a segment that fails is not halved, and maximum length; short if the run may stop."""
+def _lengths(network: Network, delays: list[float], duration: float, stops: bool) -> tuple[float, float, float]:
+    """Length [s] below which a segment that fails is not halved, length of the first one, and maximum length.
+
+    A run that may stop has shorter segments: there may be no solution after the event.
+    """
     longest = _longest(network, delays, duration)
-    return (1e-9 * duration, min(longest, duration / 64.0)) if stops else (np.inf, longest)
+    if not stops:
+        return np.inf, longest, longest
+    return 1e-9 * duration, min(longest, duration / _FIRST), min(longest, duration / _LATER)
+
+
+def _reached(times: Array, left: float, reach: float) -> float:
+    """End of a segment of a given length; the last output time before it, if that is in its second half.
+
+    Segments between evenly spaced output times then share a compiled solver.
+    """
+    before = float(times[np.searchsorted(times, left + reach * (1.0 + 1e-9), side="right") - 1])
+    return before if before > left + 0.5 * reach else left + reach
+
+
+def _advanced(solver: Solver, series: Series, left: float, grid: Array, state: Array, last: float) -> Array:
+    """Finite states (nstates, ngrid) at times of a segment; SolverError if there are none."""
+    found = solver.advance(series, left, grid, state)
+    if not np.isfinite(found).all():
+        raise SolverError(f"the solver must reach {last:g} s, got to {left:g} s: a state is not finite after that")
+    return found
 
 
 def _longest(network: Network, delays: list[float], duration: float) -> float:
