@@ -181,6 +181,8 @@ def checked_limits(limits: object, name: str) -> tuple[float, float, float]:
 
 def checked_count(value: float | Real, name: str, minimum: int = 0, maximum: int = MAXIMUM) -> int:
     """Integer between a minimum and a maximum."""
+    if type(value) is int and minimum <= value <= maximum:
+        return value
     if not isinstance(value, Real):
         raise TypeError(f"{name} must be an integer of at least {minimum}, got {value!r}")
     number = one_number(value, name, f"an integer of at least {minimum}")

@@ -56,6 +56,7 @@ from ctrlplan.trajectories.one_time import (
     trigonometric_series,
 )
 from ctrlplan.trajectories.quadrature import gauss
+from ctrlplan.trajectories.sampling import in_products
 
 _MEET = 0.25
 """The ends coincide if their distance on the circle is below this fraction of that to all neighbours."""
@@ -704,8 +705,8 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: in
 
 
 @lru_cache(maxsize=128)
-def basis_proxy(system: NewtonSystem, low: int, high: int) -> Array | None:
-    """Chebyshev coefficients (high - low + 1, size, nterms) of derivatives of the basis on the unit interval.
+def basis_interpolant(system: NewtonSystem, low: int, high: int) -> Array | None:
+    """Interpolants (high - low + 1, size, nterms) of derivatives of the basis on the unit interval.
 
     None where they are not resolved.
     """
@@ -714,7 +715,7 @@ def basis_proxy(system: NewtonSystem, low: int, high: int) -> Array | None:
         return system.taylor(u, order).transpose(1, 0, 2) * FACTORIALS[: order + 1, None, None]
 
     found = chebyshev_proxy(jet, (0.0, 1.0), low, high)
-    return None if found is None else readonly(found)
+    return None if found is None else readonly(in_products(found))
 
 
 @lru_cache(maxsize=256)

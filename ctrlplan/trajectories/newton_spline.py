@@ -273,7 +273,8 @@ class NewtonSpline(WaypointSpline):
         given = point.jet[: order + 1]
         if len(given) > order and point.complete:
             return given
-        found = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0]
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0]
         found[: len(given)] = np.where(np.isnan(given), found[: len(given)], given)
         return found
 

@@ -22,6 +22,7 @@ from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.pieces import Pieces, fitted, scales
 from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
 from ctrlplan.trajectories.polynomial import PolySpline
+from ctrlplan.trajectories.sampling import FEW, sample_segments
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
 from ctrlplan.trajectories.waypoint import Entries, Waypoint
@@ -36,8 +37,8 @@ from ctrlplan.trajectories.waypoint_spline import (
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
-_FEW, _MANY = 16, 200
-"""Number of segments up to which each is evaluated by itself, and number of times in each above which it is."""
+_FEW, _DENSE = 16, 8
+"""Number of segments up to which few times are evaluated one by one; times per segment from which all are dense."""
 
 
 class PiecewiseSpline(WaypointSpline):
@@ -421,20 +422,6 @@ class PiecewiseSpline(WaypointSpline):
             out[:, list(pieces.axes)] = pieces.jet(segment, u, order) * scale
         return out
 
-    def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
-        duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
-        powers = duration ** -np.arange(low, high + 1.0)[:, None, None]
-        found = [pieces.proxy(segment, low, high) for pieces in self._pieces]
-        known = [proxy * powers for proxy in found if proxy is not None]
-        if len(known) < len(found):
-            return super()._segment_proxy(segment, low, high)
-        if len(known) == 1:
-            return known[0]
-        out = np.zeros((high - low + 1, self.naxes, max(proxy.shape[2] for proxy in known)))
-        for pieces, proxy in zip(self._pieces, known, strict=True):
-            out[:, list(pieces.axes), : proxy.shape[2]] = proxy
-        return out
-
     def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
         """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""
         if self._is_extreme(order) or not s.size:
@@ -461,17 +448,42 @@ class PiecewiseSpline(WaypointSpline):
             rows = self._rows(float(t[0]), high, left)
             if rows is not None:
                 return np.array(rows).T[low:, :, None]
-        times, last = self.breakpoints, self.breakpoints.size - 2
-        segments = np.searchsorted(times, t, side="left" if left else "right") - 1
-        if not left:
-            segments[t == times[-1]] = last
-        inside = (segments >= 0) & (segments <= last)
-        touched = min(int(np.count_nonzero(np.diff(segments))) + 1, last + 1)
-        if touched <= _FEW or t.size > _MANY * touched or self._is_extreme(high) or not inside.all():
+        if self._is_extreme(high) or not t.size:
+            return super()._sample(t, low, high, left)
+        times = self.breakpoints
+        first, last = float(t.min()), float(t.max())
+        if not (first > times[0] if left else first >= times[0]) or not last <= times[-1]:
             return super()._sample(t, low, high, left)
         with np.errstate(over="ignore", invalid="ignore"):
-            out = self._jets(segments, t - times[segments], low, high)
+            out = self._sample_inside(t, low, high, left, (first, last))
         return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
+
+    def _sample_inside(self, t: Array, low: int, high: int, left: bool, span: tuple[float, float]) -> Array:
+        """Derivatives low to high at times of the plan, between the first and the last of them."""
+        times = self.breakpoints
+        begin, end = times[1:-1].searchsorted(span).tolist()
+        if t.size > max(FEW, _DENSE * (end - begin)) and all([p.is_resolved(low, high) for p in self._pieces]):
+            out = np.empty((high - low + 1, self.naxes, t.size))
+            sample_segments(
+                times, lambda own: self._rows_of(own, low, high), self._filled[:, low : high + 1], t, left, out
+            )
+            return out
+        segments = times[1:-1].searchsorted(t, side="left" if left else "right")
+        touched = int(np.count_nonzero(segments[1:] != segments[:-1])) + 1
+        if touched <= _FEW:
+            return super()._sample(t, low, high, left)
+        return self._jets(segments, t - times[segments], low, high)
+
+    def _rows_of(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
+        """Rows (nsegments, norders * naxes, nterms) of interpolants of segments."""
+        found = [pieces.rows(segments, low, high) for pieces in self._pieces]
+        out = found[0]
+        if len(found) > 1:
+            out = np.zeros((segments.size, high - low + 1, self.naxes, max(rows.shape[3] for rows in found)))
+            for pieces, rows in zip(self._pieces, found, strict=True):
+                out[:, :, list(pieces.axes), : rows.shape[3]] = rows
+        scale = self._durations[segments, None] ** -np.arange(low, high + 1.0)
+        return (out * scale[:, :, None, None]).reshape(segments.size, -1, out.shape[3])
 
     _rows = WaypointSpline._rows  # `_sample` calls it
 
