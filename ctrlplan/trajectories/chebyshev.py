@@ -36,15 +36,15 @@ def chebyshev_proxy(
     return None
 
 
-def resolved_size(coefficients: Array, rtol: float = 3e-14, tail: int | None = None) -> int | None:
+def resolved_size(coefficients: Array, rtol: float = 3e-14) -> int | None:
     """Number of significant leading coefficients; None if not resolved.
 
-    A series is resolved if its last quarter, or its last `tail` coefficients, lie
-    below `rtol` of its largest coefficient. These are the rounding of the values,
-    and so are all coefficients of the same size.
+    A series is resolved if its last quarter lies below `rtol` of its largest
+    coefficient. That quarter is the rounding of the values, and so are all
+    coefficients of the same size.
     """
     size = np.abs(coefficients).reshape(-1, coefficients.shape[-1])
-    largest, last = size.max(axis=1), size[:, -(tail or max(4, size.shape[1] // 4)) :].max(axis=1)
+    largest, last = size.max(axis=1), size[:, -max(4, size.shape[1] // 4) :].max(axis=1)
     if (last > rtol * largest).any():
         return None
     matters = (size > (2.0 * np.maximum(last, 1e-16 * largest))[:, None]).any(axis=0).nonzero()[0]

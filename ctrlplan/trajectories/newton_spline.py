@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.chebyshev import points, resolved_size, transform
+from ctrlplan.trajectories.chebyshev import points, transform
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
@@ -21,6 +22,9 @@ from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing, within
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
+
+_RESOLVED = 3e-14
+"""Size of the last coefficients of an interpolant relative to the largest, below which others do not matter."""
 
 Given = tuple[tuple[int, ...], ...]
 Kind = tuple[Given, float | None, bool]
@@ -259,13 +263,15 @@ class NewtonSpline(WaypointSpline):
     def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
         size = max([system.size for _, system, _ in self._parts])
         interval = (0.0, float(self.breakpoints[1] - self.breakpoints[0]))
-        if not self.alpha:  # an interpolant of the same degree is the polynomial
-            degree = size - size % 2  # an even number of points, none of them in the middle
-        else:  # more terms than functions; as the last ones decrease fast, few of them show that they suffice
-            degree = size + 11 + size % 2 + 2 * int(self.alpha * (2.0 + size / 24.0))
-        coefficients = transform(self._jet_between(points(degree, *interval), high)[low:])
-        used = resolved_size(coefficients, tail=4) if self.alpha else degree + 1
-        return super()._segment_proxy(segment, low, high) if used is None else coefficients[..., :used]
+        # A polynomial is its own interpolant; other functions have more terms. An even number of points avoids the
+        # middle of the interval, where a waypoint often is.
+        terms = size + math.ceil(self.alpha and 8.0 + self.alpha * (2.3 + 0.16 * size))
+        coefficients = transform(self._jet_between(points(terms + terms % 2 - 1, *interval), high)[low:])
+        if not self.alpha:
+            return coefficients[..., :terms]
+        sizes = np.abs(coefficients)
+        missed = sizes[..., -2:].max(axis=2) > _RESOLVED * sizes.max(axis=2)
+        return super()._segment_proxy(segment, low, high) if missed.any() else coefficients
 
     def _end_jet(self, segment: int, s: float, order: int) -> Array:
         # What a waypoint prescribes is not computed.
