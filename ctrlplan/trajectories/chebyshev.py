@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.common import Array, readonly
 
 DEGREES = (16, 32, 64, 128)
 """Degrees of interpolants that are tried, in turn."""
@@ -83,6 +83,12 @@ def roots_of_rows(coefficients: Array) -> tuple[NDArray[np.intp], Array]:
 def points(degree: int, a: float, b: float) -> Array:
     """Chebyshev points of an interval, one more than the degree."""
     return 0.5 * (a + b) + 0.5 * (b - a) * _nodes(degree)
+
+
+@lru_cache(maxsize=64)
+def unit_points(degree: int) -> Array:
+    """Chebyshev points of the interval from 0 to 1."""
+    return readonly(points(degree, 0.0, 1.0))
 
 
 def transform(values: Array) -> Array:

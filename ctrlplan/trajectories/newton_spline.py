@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.chebyshev import points, transform
+from ctrlplan.trajectories.chebyshev import transform, unit_points
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
@@ -248,25 +248,17 @@ class NewtonSpline(WaypointSpline):
             out[:, list(axes)] = values
         return out
 
-    def _jet_between(self, s: Array, order: int) -> Array:
-        """As `_jet`, at few times between the nodes."""
-        u, scale = s / self._duration, derivative_scale(self._duration, order)[:, None, None]
-        if len(self._parts) == 1:
-            _, system, coefficients = self._parts[0]
-            return (coefficients.T @ system.taylor_between(u, order)) * scale
-        out = np.empty((order + 1, self.naxes, s.size))
-        for axes, system, coefficients in self._parts:
-            out[:, list(axes)] = coefficients.T @ system.taylor_between(u, order)
-        out *= scale
-        return out
-
     def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
         size = max([system.size for _, system, _ in self._parts])
-        interval = (0.0, float(self.breakpoints[1] - self.breakpoints[0]))
         # A polynomial is its own interpolant; other functions have more terms. An even number of points avoids the
         # middle of the interval, where a waypoint often is.
         terms = size + math.ceil(self.alpha and 8.0 + self.alpha * (2.3 + 0.16 * size))
-        coefficients = transform(self._jet_between(points(terms + terms % 2 - 1, *interval), high)[low:])
+        u = unit_points(terms + terms % 2 - 1)
+        values = np.empty((high - low + 1, self.naxes, u.size))
+        for axes, system, coefficients in self._parts:
+            values[:, list(axes)] = coefficients.T @ system.taylor_between(u, high)[low:]
+        values *= derivative_scale(self._duration, high)[low:, None, None]
+        coefficients = transform(values)
         if not self.alpha:
             return coefficients[..., :terms]
         sizes = np.abs(coefficients)

@@ -187,7 +187,7 @@ def _sample_grouped(
     if where.size:
         _place_entries(entries[segments.repeat(counts)[where] + left], where, out)
     if segments[-1] == times.size - 2 and not left:  # the end belongs to the last segment
-        where = (t == times[-1]).nonzero()[0]
+        where = (t[bounds[-1] - counts[-1] :] == times[-1]).nonzero()[0] + (bounds[-1] - counts[-1])
         if where.size:
             _place_entries(entries[[-1]], where, out)
 
@@ -195,7 +195,8 @@ def _sample_grouped(
 def _place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
     """Replace the lowest derivatives at some times by those that are known, (ntimes, k, naxes)."""
     rows, place = known.transpose(1, 2, 0), out[: known.shape[1]]
-    place[:, :, where] = np.where(np.isnan(rows), place[:, :, where], rows)
+    free = np.isnan(rows)
+    place[:, :, where] = np.where(free, place[:, :, where], rows) if free.any() else rows
 
 
 def in_products(coefficients: Array) -> Array:
