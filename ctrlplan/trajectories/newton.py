@@ -420,18 +420,16 @@ class NewtonSystem(Fields):
     @cached_property
     def functions(self) -> Array:
         """Values (size, ntime) of the basis functions on a grid that resolves any plan."""
-        u, alpha = _grid(2 * self.size + 1), effective(self.alpha)
-        first, second = u - self._first[:, None], u - self._second[:, None]
-        single = first
-        if alpha:
-            first, second = np.sin(0.5 * alpha * first), 0.5 * alpha * second
-            single, pair = (2.0 / alpha) * first * np.cos(second), (2.0 / alpha) ** 2 * first * np.sin(second)
-        else:
-            pair = first * second
-        out = np.empty((2 * len(pair) + 1, u.size))
+        u, half, count = _grid(2 * self.size + 1), 0.5 * effective(self.alpha), 2 * len(self._second)
+        apart = u - self._nodes[:count, None]
+        out = np.empty((count + 1, u.size))
         out[0] = 1.0
-        np.multiply.accumulate(pair, axis=0, out=out[2::2])
-        np.multiply(out[:-1:2], single, out=out[1::2])
+        if half:
+            apart *= half
+            np.multiply.accumulate(np.sin(apart) / half, axis=0, out=out[1:])
+            out[1::2] *= np.cos(apart[1::2])
+        else:
+            np.multiply.accumulate(apart, axis=0, out=out[1:])
         if self._fold:
             out[self.size - 1] += self._fold * out[self.size]
         return out[: self.size]
@@ -442,9 +440,18 @@ class NewtonSystem(Fields):
         first, second = self._first.tolist(), self._second.tolist()
         return _ranges(effective(self.alpha), tuple(first), tuple(second))[: self.size - 1]
 
+    @cached_property
+    def higher_ranges(self) -> Array:
+        """The same from the third function on, as an array."""
+        return readonly(np.array(self.ranges[1:]))
+
     def stays_near(self, coefficients: Array, factor: float) -> bool:
-        """Whether coefficients exclude a range above a multiple of the distance of the first two positions."""
-        if self._fold or self._orders[:2] != (0, 0):
+        """Whether coefficients exclude a range above a multiple of the distance of the first two positions.
+
+        Only of functions between two waypoints, whose ranges do not depend on the
+        times; otherwise the values of all functions are as fast as their ranges.
+        """
+        if self._fold or self._orders[:2] != (0, 0) or self.waypoint_index.max() > 1:
             return False
         first, *others = self.ranges
         allowed = factor * abs(self._triangle.item(1, 1)) - first

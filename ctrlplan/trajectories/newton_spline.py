@@ -174,26 +174,24 @@ class NewtonSpline(WaypointSpline):
 
     def _check_swing(self) -> None:
         """Warn, unless disabled, if the plan swings far beyond its waypoints."""
-        if self._options.warn and not self._stays_near():
+        if not self._options.warn or all([s.stays_near(c, MAXIMUM_SWING) for _, s, c in self._parts]):
+            return
+        if len(self._parts) == 1:
+            _, system, coefficients = self._parts[0]
+            values = coefficients.T @ system.functions
+        else:
             values = np.empty((self.naxes, 2 * max([s.size for _, s, _ in self._parts]) + 1))
             for axes, system, coefficients in self._parts:
                 found = coefficients.T @ system.functions
-                if len(self._parts) == 1:
-                    values = found
-                else:
-                    values[list(axes), : found.shape[1]] = found
-                    values[list(axes), found.shape[1] :] = found[:, :1]
-            remedy = "use PiecewiseSpline, one polynomial per segment, or fit for samples"
-            if self.alpha:
-                remedy = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {remedy}"
-            if within(values, np.array([w.position for w in self.waypoints])):
-                return  # the usual case, before derivatives are evaluated
-            table, _ = given_entries(self.waypoints)
-            warn_of_swing(values, np.array(self._times), table, self.end, self.labels, remedy)
-
-    def _stays_near(self) -> bool:
-        """Whether a bound of the coefficients excludes a swing."""
-        return all([system.stays_near(coefficients, MAXIMUM_SWING) for _, system, coefficients in self._parts])
+                values[list(axes), : found.shape[1]] = found
+                values[list(axes), found.shape[1] :] = found[:, :1]
+        if within(values, [w.jet[0].tolist() for w in self.waypoints]):
+            return  # the usual case, before derivatives are evaluated
+        remedy = "use PiecewiseSpline, one polynomial per segment, or fit for samples"
+        if self.alpha:
+            remedy = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {remedy}"
+        table, _ = given_entries(self.waypoints)
+        warn_of_swing(values, np.array(self._times), table, self.end, self.labels, remedy)
 
     def resolved(self, table: NDArray[Any], digits: int) -> Self:
         """Plan with coefficients from decimal entries, where possible.

@@ -394,16 +394,18 @@ class PiecewiseSpline(WaypointSpline):
         if self.alpha > math.pi:
             return False
         positions = np.ascontiguousarray(self._entries.table[:, 0].T)  # extrema of long rows are faster
-        allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (positions.max(axis=1) - positions.min(axis=1))
+        allowed = np.maximum.reduce(positions, axis=1) - np.minimum.reduce(positions, axis=1)
+        allowed *= 0.5 * (MAXIMUM_SWING - 1.0)
         for pieces in self._pieces:
+            limits = allowed if len(self._pieces) == 1 else allowed[list(pieces.axes)]
             for run in pieces.runs:
                 if not run.system.hermite:
                     return False
-                weights = np.array(run.system.ranges[1:])
+                weights = run.system.higher_ranges
                 if weights.size:
                     sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
-                    own = (weights @ sizes).reshape(len(pieces.axes), -1).max(axis=1)
-                    if not (own <= allowed[list(pieces.axes)]).all():
+                    own = np.maximum.reduce((weights @ sizes).reshape(len(pieces.axes), -1), axis=1)
+                    if not (own <= limits).all():
                         return False
         return True
 
