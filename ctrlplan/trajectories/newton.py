@@ -374,10 +374,10 @@ class NewtonSystem(Fields):
 
     def series_at(self, columns: Sequence[Sequence[float]], u: float, order: int) -> list[list[float]]:
         """Taylor series of each axis at one normalised time, a number, from the coefficients by axis."""
-        nodes, pairs, places = self._backwards
         if not effective(self.alpha):
-            gaps = [u - node for node in nodes]
+            gaps = [u - node for node in self._nodes_backwards]
             return [polynomial_series(gaps, column, order) for column in columns]
+        pairs, places = self._pairs
         if self._fold:
             columns = [[*column, self._fold * column[-1]] for column in columns]
         distinct = [pair_series(self.alpha, u - first, u - second, max(order, 3)) for first, second in pairs]
@@ -385,12 +385,17 @@ class NewtonSystem(Fields):
         return [trigonometric_series(factors, column, order) for column in columns]
 
     @cached_property
-    def _backwards(self) -> tuple[list[float], list[tuple[float, float]], list[int]]:
-        """Nodes of the products, the last one first; different pairs of nodes; the place of each pair among them."""
-        every = list(zip(self._first.tolist(), self._second.tolist(), strict=True))
-        nodes = [node for pair in every for node in pair][: self.size - 1]
-        pairs = list(dict.fromkeys(every))
-        return nodes[::-1], pairs, [pairs.index(pair) for pair in every[::-1]]
+    def _nodes_backwards(self) -> list[float]:
+        """Nodes of the products, the last one first."""
+        return self._nodes[self.size - 2 :: -1].tolist() if self.size > 1 else []
+
+    @cached_property
+    def _pairs(self) -> tuple[list[tuple[float, float]], list[int]]:
+        """Different pairs of nodes, and the place of each pair among them, the last one first."""
+        pairs: dict[tuple[float, float], int] = {}
+        every = zip(self._first.tolist(), self._second.tolist(), strict=True)
+        places = [pairs.setdefault(pair, len(pairs)) for pair in every]
+        return list(pairs), places[::-1]
 
     def _across(self, times: Sequence[float], duration: float) -> float:
         """Minimum distance on the circle from a waypoint near the end to one near the start, without the two ends."""
