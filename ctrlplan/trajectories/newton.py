@@ -162,28 +162,28 @@ class NewtonSystem(Fields):
             alpha=alpha,
             size=size,
             gamma=phase,
-            waypoint_index=waypoints,
-            order_index=orders,
+            waypoint_index=readonly(waypoints),
+            order_index=readonly(orders),
             _orders=tuple(orders.tolist()),
             _fold=fold,
-            _nodes=nodes,
+            _nodes=readonly(nodes),
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
-            hermite=all(g == tuple(range(len(g))) for g in given),
-            _positions=(orders == 0).astype(float)[:, None],
+            hermite=all([g == tuple(range(len(g))) for g in given]),
+            _positions=readonly((orders == 0).astype(float)[:, None]),
             _anchor=int((orders == 0).argmax()),
         )
         beyond = times[:, None] - nodes
         if apart is not None:
             beyond[:, :count] = apart[:, waypoints]
-        jets = self._taylor(beyond.T[: size - size % 2 : 2], beyond.T[1:size:2], max(orders))
+        jets = self._taylor(beyond.T[: size - size % 2 : 2], beyond.T[1:size:2], max(self._orders))
         collocation = jets[:, orders, waypoints].T
         triangle, spread = (
             (np.asfortranarray(collocation), None)
             if self.hermite and size == count
             else _factor(collocation, self.hermite, self.squared_samples(smooth) if size > count else None, lead)
         )
-        self._set_fields(_triangle=triangle, _spread=spread)
+        self._set_fields(_triangle=readonly(triangle), _spread=spread)
 
         if not self._triangle.diagonal().all():
             raise ValueError("the constraints must determine the plan, got a singular system")
@@ -469,7 +469,7 @@ class NewtonSystem(Fields):
     def amplification(self) -> float:
         """Maximum amplification of rounding errors by the solution."""
         scaled = self._triangle / np.abs(self._triangle).max(axis=0)
-        inverse: Array = blas.dtrsm(1.0, scaled, np.eye(len(scaled)), lower=1)
+        inverse: Array = blas.dtrsm(1.0, scaled, _identity(len(scaled)), lower=1)
         return float((np.abs(inverse) @ np.abs(scaled)).max())
 
     @cached_property
@@ -512,6 +512,11 @@ def _change_to_cosines(sums: Array, cosine: Array, ratio: Array, half: float) ->
         sums[2] -= (0.5 * square) * factors
         if order > 2:
             sums[3] -= (square / 6.0) * (3.0 * factors - 2.0) * sums[1]
+
+
+@lru_cache(maxsize=128)
+def _identity(size: int) -> Array:
+    return readonly(np.asfortranarray(np.eye(size)))
 
 
 @lru_cache(maxsize=256)
@@ -604,17 +609,21 @@ def _constraints(
     distance.
     """
     used = [i for i, g in enumerate(given) if g]
-    u = times[used]
-    distance = np.abs(u[:, None] - u)
-    if alpha:
-        distance = np.abs(np.sin(0.5 * alpha * distance)) * (2.0 / alpha)
-    meet = meet and len(used) > 2 and distance[0, -1] < _MEET * np.diag(distance, 1).min()
-    chosen = [0, len(used) - 1] if meet else [0]
-    product = distance[chosen].prod(axis=0)
-    while len(chosen) < len(used):
+    u, half = times[used].tolist(), 0.5 * alpha
+
+    def distances(v: float) -> list[float]:
+        return [abs(math.sin(half * (w - v)) if half else w - v) for w in u]
+
+    product = distances(u[0])
+    if meet:
+        nearest = min([distances(v)[i] for i, v in enumerate(u[:-1], 1)], default=0.0)
+        meet = len(used) > 2 and product[-1] < _MEET * nearest
+    chosen = [0]
+    while len(chosen) < len(u):
         # Rescaled, so that the products do not underflow for many waypoints.
-        farthest = int(product.argmax())
-        product = product * (distance[farthest] / product[farthest])
+        farthest = len(u) - 1 if meet and len(chosen) == 1 else product.index(max(product))
+        scale = product[farthest] or 1.0
+        product = [p * (d / scale) for p, d in zip(product, distances(u[farthest]), strict=True)]
         chosen.append(farthest)
     ordered = [used[i] for i in chosen]
     if not meet:

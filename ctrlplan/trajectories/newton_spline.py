@@ -6,6 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -343,7 +344,7 @@ def _solved(system: NewtonSystem, data: Array, times: list[float], duration: flo
 
 def _apart(times: list[float], relative: Array, duration: float) -> Array | None:
     """Differences of the normalised times, if those of the rounded times would lose digits."""
-    if np.diff(relative).min(initial=1.0) > 1e-4:
+    if min([after - before for before, after in pairwise(relative.tolist())], default=1.0) > 1e-4:
         return None
     return np.subtract.outer(times, times) / duration
 
