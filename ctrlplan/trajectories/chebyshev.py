@@ -21,7 +21,7 @@ def chebyshev_proxy(
     high: int,
     degrees: Sequence[int] = DEGREES,
 ) -> Array | None:
-    """Chebyshev coefficients of derivatives low to high, each from exact values, of the first degree that resolves them.
+    """Chebyshev coefficients of derivatives low to high, from exact values, of the first degree that resolves them.
 
     Returns
     -------

@@ -496,12 +496,17 @@ class PiecewiseSpline(WaypointSpline):
         if not is_moderate(duration, order):
             return None
         if len(self._pieces) == 1:
-            return derivatives(self._pieces[0].series_at(segment, s / duration, order), duration)
-        found: list[list[float]] = [[]] * self.naxes
-        for pieces in self._pieces:
-            rows = derivatives(pieces.series_at(segment, s / duration, order), duration)
-            for axis, row in zip(pieces.axes, rows, strict=True):
-                found[axis] = row
+            found = derivatives(self._pieces[0].series_at(segment, s / duration, order), duration)
+        else:
+            found = [[]] * self.naxes
+            for pieces in self._pieces:
+                rows = derivatives(pieces.series_at(segment, s / duration, order), duration)
+                for axis, row in zip(pieces.axes, rows, strict=True):
+                    found[axis] = row
+        if s == 0.0 or s == duration:  # what a waypoint prescribes is not computed
+            for k, entries in enumerate(self._filled[segment + (s == duration), : order + 1].tolist()):
+                for row, value in zip(found, entries, strict=True):
+                    row[k] = row[k] if math.isnan(value) else value
         return found
 
     @cached_property
