@@ -262,7 +262,7 @@ _NO_UNIT = frozenset({"dimensionless"})
 
 def _check_kinds(values: Any, name: str) -> None:
     """Raise for values that numpy would convert to numbers although they are not."""
-    if type(values) in (float, int) or values is None:
+    if type(values) in (float, int) or values is None or (type(values) is np.ndarray and values.dtype.kind in "iuf"):
         return
     if isinstance(values, list | tuple):
         for value in values:

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.common import Array, readonly
 
 DEGREES = (16, 32, 64, 128)
 """Degrees of interpolants that are tried, in turn."""
@@ -21,7 +21,7 @@ def chebyshev_proxy(
     high: int,
     degrees: Sequence[int] = DEGREES,
 ) -> Array | None:
-    """Chebyshev coefficients of derivatives low to high, each from exact values, of the first degree that resolves them.
+    """Chebyshev coefficients of derivatives low to high, from exact values, of the first degree that resolves them.
 
     Returns
     -------
@@ -36,15 +36,15 @@ def chebyshev_proxy(
     return None
 
 
-def resolved_size(coefficients: Array, rtol: float = 3e-14, tail: int | None = None) -> int | None:
+def resolved_size(coefficients: Array, rtol: float = 3e-14) -> int | None:
     """Number of significant leading coefficients; None if not resolved.
 
-    A series is resolved if its last quarter, or its last `tail` coefficients, lie
-    below `rtol` of its largest coefficient. These are the rounding of the values,
-    and so are all coefficients of the same size.
+    A series is resolved if its last quarter lies below `rtol` of its largest
+    coefficient. That quarter is the rounding of the values, and so are all
+    coefficients of the same size.
     """
     size = np.abs(coefficients).reshape(-1, coefficients.shape[-1])
-    largest, last = size.max(axis=1), size[:, -(tail or max(4, size.shape[1] // 4)) :].max(axis=1)
+    largest, last = size.max(axis=1), size[:, -max(4, size.shape[1] // 4) :].max(axis=1)
     if (last > rtol * largest).any():
         return None
     matters = (size > (2.0 * np.maximum(last, 1e-16 * largest))[:, None]).any(axis=0).nonzero()[0]
@@ -83,6 +83,12 @@ def roots_of_rows(coefficients: Array) -> tuple[NDArray[np.intp], Array]:
 def points(degree: int, a: float, b: float) -> Array:
     """Chebyshev points of an interval, one more than the degree."""
     return 0.5 * (a + b) + 0.5 * (b - a) * _nodes(degree)
+
+
+@lru_cache(maxsize=64)
+def unit_points(degree: int) -> Array:
+    """Chebyshev points of the interval from 0 to 1."""
+    return readonly(points(degree, 0.0, 1.0))
 
 
 def transform(values: Array) -> Array:

@@ -23,15 +23,16 @@ class Fields(Frozen):
             If a name is not annotated in the class or one of its bases, or is
             set already.
         """
-        unknown = values.keys() - _declared(type(self).__mro__)
-        if unknown:
+        declared = _declared(type(self).__mro__)
+        if not values.keys() <= declared:
+            unknown = values.keys() - declared
             raise AttributeError(
                 f"fields of {type(self).__name__} must be annotated in the class, as ``{min(unknown)}: float``, "
                 f"got {', '.join(sorted(unknown))}"
             )
-        again = values.keys() & self.__dict__.keys()
-        if again:
-            raise AttributeError(f"{type(self).__name__} is immutable; {min(again)} is set already")
+        if not values.keys().isdisjoint(self.__dict__):
+            again = min(values.keys() & self.__dict__.keys())
+            raise AttributeError(f"{type(self).__name__} is immutable; {again} is set already")
         for name, value in values.items():
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 values[name] = value.copy(order="K")

@@ -56,6 +56,7 @@ from ctrlplan.trajectories.one_time import (
     trigonometric_series,
 )
 from ctrlplan.trajectories.quadrature import gauss
+from ctrlplan.trajectories.sampling import in_products
 
 _MEET = 0.25
 """The ends coincide if their distance on the circle is below this fraction of that to all neighbours."""
@@ -161,28 +162,28 @@ class NewtonSystem(Fields):
             alpha=alpha,
             size=size,
             gamma=phase,
-            waypoint_index=waypoints,
-            order_index=orders,
+            waypoint_index=readonly(waypoints),
+            order_index=readonly(orders),
             _orders=tuple(orders.tolist()),
             _fold=fold,
-            _nodes=nodes,
+            _nodes=readonly(nodes),
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
-            hermite=all(g == tuple(range(len(g))) for g in given),
-            _positions=(orders == 0).astype(float)[:, None],
+            hermite=all([g == tuple(range(len(g))) for g in given]),
+            _positions=readonly((orders == 0).astype(float)[:, None]),
             _anchor=int((orders == 0).argmax()),
         )
         beyond = times[:, None] - nodes
         if apart is not None:
             beyond[:, :count] = apart[:, waypoints]
-        jets = self._taylor(beyond.T[: size - size % 2 : 2], beyond.T[1:size:2], max(orders))
+        jets = self._taylor(beyond.T[: size - size % 2 : 2], beyond.T[1:size:2], max(self._orders))
         collocation = jets[:, orders, waypoints].T
         triangle, spread = (
             (np.asfortranarray(collocation), None)
             if self.hermite and size == count
             else _factor(collocation, self.hermite, self.squared_samples(smooth) if size > count else None, lead)
         )
-        self._set_fields(_triangle=triangle, _spread=spread)
+        self._set_fields(_triangle=readonly(triangle), _spread=spread)
 
         if not self._triangle.diagonal().all():
             raise ValueError("the constraints must determine the plan, got a singular system")
@@ -374,10 +375,10 @@ class NewtonSystem(Fields):
 
     def series_at(self, columns: Sequence[Sequence[float]], u: float, order: int) -> list[list[float]]:
         """Taylor series of each axis at one normalised time, a number, from the coefficients by axis."""
-        nodes, pairs, places = self._backwards
         if not effective(self.alpha):
-            gaps = [u - node for node in nodes]
+            gaps = [u - node for node in self._nodes_backwards]
             return [polynomial_series(gaps, column, order) for column in columns]
+        pairs, places = self._pairs
         if self._fold:
             columns = [[*column, self._fold * column[-1]] for column in columns]
         distinct = [pair_series(self.alpha, u - first, u - second, max(order, 3)) for first, second in pairs]
@@ -385,12 +386,17 @@ class NewtonSystem(Fields):
         return [trigonometric_series(factors, column, order) for column in columns]
 
     @cached_property
-    def _backwards(self) -> tuple[list[float], list[tuple[float, float]], list[int]]:
-        """Nodes of the products, the last one first; different pairs of nodes; the place of each pair among them."""
-        every = list(zip(self._first.tolist(), self._second.tolist(), strict=True))
-        nodes = [node for pair in every for node in pair][: self.size - 1]
-        pairs = list(dict.fromkeys(every))
-        return nodes[::-1], pairs, [pairs.index(pair) for pair in every[::-1]]
+    def _nodes_backwards(self) -> list[float]:
+        """Nodes of the products, the last one first."""
+        return self._nodes[self.size - 2 :: -1].tolist() if self.size > 1 else []
+
+    @cached_property
+    def _pairs(self) -> tuple[list[tuple[float, float]], list[int]]:
+        """Different pairs of nodes, and the place of each pair among them, the last one first."""
+        pairs: dict[tuple[float, float], int] = {}
+        every = zip(self._first.tolist(), self._second.tolist(), strict=True)
+        places = [pairs.setdefault(pair, len(pairs)) for pair in every]
+        return list(pairs), places[::-1]
 
     def _across(self, times: Sequence[float], duration: float) -> float:
         """Minimum distance on the circle from a waypoint near the end to one near the start, without the two ends."""
@@ -420,18 +426,16 @@ class NewtonSystem(Fields):
     @cached_property
     def functions(self) -> Array:
         """Values (size, ntime) of the basis functions on a grid that resolves any plan."""
-        u, alpha = _grid(2 * self.size + 1), effective(self.alpha)
-        first, second = u - self._first[:, None], u - self._second[:, None]
-        single = first
-        if alpha:
-            first, second = np.sin(0.5 * alpha * first), 0.5 * alpha * second
-            single, pair = (2.0 / alpha) * first * np.cos(second), (2.0 / alpha) ** 2 * first * np.sin(second)
-        else:
-            pair = first * second
-        out = np.empty((2 * len(pair) + 1, u.size))
+        u, half, count = _grid(2 * self.size + 1), 0.5 * effective(self.alpha), 2 * len(self._second)
+        apart = u - self._nodes[:count, None]
+        out = np.empty((count + 1, u.size))
         out[0] = 1.0
-        np.multiply.accumulate(pair, axis=0, out=out[2::2])
-        np.multiply(out[:-1:2], single, out=out[1::2])
+        if half:
+            apart *= half
+            np.multiply.accumulate(np.sin(apart) / half, axis=0, out=out[1:])
+            out[1::2] *= np.cos(apart[1::2])
+        else:
+            np.multiply.accumulate(apart, axis=0, out=out[1:])
         if self._fold:
             out[self.size - 1] += self._fold * out[self.size]
         return out[: self.size]
@@ -442,9 +446,18 @@ class NewtonSystem(Fields):
         first, second = self._first.tolist(), self._second.tolist()
         return _ranges(effective(self.alpha), tuple(first), tuple(second))[: self.size - 1]
 
+    @cached_property
+    def higher_ranges(self) -> Array:
+        """The same from the third function on, as an array."""
+        return readonly(np.array(self.ranges[1:]))
+
     def stays_near(self, coefficients: Array, factor: float) -> bool:
-        """Whether coefficients exclude a range above a multiple of the distance of the first two positions."""
-        if self._fold or self._orders[:2] != (0, 0):
+        """Whether coefficients exclude a range above a multiple of the distance of the first two positions.
+
+        Only of functions between two waypoints, whose ranges do not depend on the
+        times; otherwise the values of all functions are as fast as their ranges.
+        """
+        if self._fold or self._orders[:2] != (0, 0) or self.waypoint_index.max() > 1:
             return False
         first, *others = self.ranges
         allowed = factor * abs(self._triangle.item(1, 1)) - first
@@ -457,7 +470,7 @@ class NewtonSystem(Fields):
     def amplification(self) -> float:
         """Maximum amplification of rounding errors by the solution."""
         scaled = self._triangle / np.abs(self._triangle).max(axis=0)
-        inverse: Array = blas.dtrsm(1.0, scaled, np.eye(len(scaled)), lower=1)
+        inverse: Array = blas.dtrsm(1.0, scaled, _identity(len(scaled)), lower=1)
         return float((np.abs(inverse) @ np.abs(scaled)).max())
 
     @cached_property
@@ -500,6 +513,11 @@ def _change_to_cosines(sums: Array, cosine: Array, ratio: Array, half: float) ->
         sums[2] -= (0.5 * square) * factors
         if order > 2:
             sums[3] -= (square / 6.0) * (3.0 * factors - 2.0) * sums[1]
+
+
+@lru_cache(maxsize=128)
+def _identity(size: int) -> Array:
+    return readonly(np.asfortranarray(np.eye(size)))
 
 
 @lru_cache(maxsize=256)
@@ -592,17 +610,21 @@ def _constraints(
     distance.
     """
     used = [i for i, g in enumerate(given) if g]
-    u = times[used]
-    distance = np.abs(u[:, None] - u)
-    if alpha:
-        distance = np.abs(np.sin(0.5 * alpha * distance)) * (2.0 / alpha)
-    meet = meet and len(used) > 2 and distance[0, -1] < _MEET * np.diag(distance, 1).min()
-    chosen = [0, len(used) - 1] if meet else [0]
-    product = distance[chosen].prod(axis=0)
-    while len(chosen) < len(used):
+    u, half = times[used].tolist(), 0.5 * alpha
+
+    def distances(v: float) -> list[float]:
+        return [abs(math.sin(half * (w - v)) if half else w - v) for w in u]
+
+    product = distances(u[0])
+    if meet:
+        nearest = min([distances(v)[i] for i, v in enumerate(u[:-1], 1)], default=0.0)
+        meet = len(used) > 2 and product[-1] < _MEET * nearest
+    chosen = [0]
+    while len(chosen) < len(u):
         # Rescaled, so that the products do not underflow for many waypoints.
-        farthest = int(product.argmax())
-        product = product * (distance[farthest] / product[farthest])
+        farthest = len(u) - 1 if meet and len(chosen) == 1 else product.index(max(product))
+        scale = product[farthest] or 1.0
+        product = [p * (d / scale) for p, d in zip(product, distances(u[farthest]), strict=True)]
         chosen.append(farthest)
     ordered = [used[i] for i in chosen]
     if not meet:
@@ -705,8 +727,8 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: in
 
 
 @lru_cache(maxsize=128)
-def basis_proxy(system: NewtonSystem, low: int, high: int) -> Array | None:
-    """Chebyshev coefficients (high - low + 1, size, nterms) of derivatives of the basis on the unit interval.
+def basis_interpolant(system: NewtonSystem, low: int, high: int) -> Array | None:
+    """Interpolants (high - low + 1, size, nterms) of derivatives of the basis on the unit interval.
 
     None where they are not resolved.
     """
@@ -715,7 +737,7 @@ def basis_proxy(system: NewtonSystem, low: int, high: int) -> Array | None:
         return system.taylor(u, order).transpose(1, 0, 2) * FACTORIALS[: order + 1, None, None]
 
     found = chebyshev_proxy(jet, (0.0, 1.0), low, high)
-    return None if found is None else readonly(found)
+    return None if found is None else readonly(in_products(found))
 
 
 @lru_cache(maxsize=256)

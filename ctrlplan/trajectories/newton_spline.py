@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.chebyshev import points, resolved_size, transform
+from ctrlplan.trajectories.chebyshev import transform, unit_points
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
@@ -21,6 +23,9 @@ from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing, within
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
+
+_RESOLVED = 3e-14
+"""Size of the last coefficients of an interpolant relative to the largest, below which others do not matter."""
 
 Given = tuple[tuple[int, ...], ...]
 Kind = tuple[Given, float | None, bool]
@@ -170,26 +175,24 @@ class NewtonSpline(WaypointSpline):
 
     def _check_swing(self) -> None:
         """Warn, unless disabled, if the plan swings far beyond its waypoints."""
-        if self._options.warn and not self._stays_near():
+        if not self._options.warn or all([s.stays_near(c, MAXIMUM_SWING) for _, s, c in self._parts]):
+            return
+        if len(self._parts) == 1:
+            _, system, coefficients = self._parts[0]
+            values = coefficients.T @ system.functions
+        else:
             values = np.empty((self.naxes, 2 * max([s.size for _, s, _ in self._parts]) + 1))
             for axes, system, coefficients in self._parts:
                 found = coefficients.T @ system.functions
-                if len(self._parts) == 1:
-                    values = found
-                else:
-                    values[list(axes), : found.shape[1]] = found
-                    values[list(axes), found.shape[1] :] = found[:, :1]
-            remedy = "use PiecewiseSpline, one polynomial per segment, or fit for samples"
-            if self.alpha:
-                remedy = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {remedy}"
-            if within(values, np.array([w.position for w in self.waypoints])):
-                return  # the usual case, before derivatives are evaluated
-            table, _ = given_entries(self.waypoints)
-            warn_of_swing(values, np.array(self._times), table, self.end, self.labels, remedy)
-
-    def _stays_near(self) -> bool:
-        """Whether a bound of the coefficients excludes a swing."""
-        return all([system.stays_near(coefficients, MAXIMUM_SWING) for _, system, coefficients in self._parts])
+                values[list(axes), : found.shape[1]] = found
+                values[list(axes), found.shape[1] :] = found[:, :1]
+        if within(values, [w.jet[0].tolist() for w in self.waypoints]):
+            return  # the usual case, before derivatives are evaluated
+        remedy = "use PiecewiseSpline, one polynomial per segment, or fit for samples"
+        if self.alpha:
+            remedy = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {remedy}"
+        table, _ = given_entries(self.waypoints)
+        warn_of_swing(values, np.array(self._times), table, self.end, self.labels, remedy)
 
     def resolved(self, table: NDArray[Any], digits: int) -> Self:
         """Plan with coefficients from decimal entries, where possible.
@@ -244,28 +247,22 @@ class NewtonSpline(WaypointSpline):
             out[:, list(axes)] = values
         return out
 
-    def _jet_between(self, s: Array, order: int) -> Array:
-        """As `_jet`, at few times between the nodes."""
-        u, scale = s / self._duration, derivative_scale(self._duration, order)[:, None, None]
-        if len(self._parts) == 1:
-            _, system, coefficients = self._parts[0]
-            return (coefficients.T @ system.taylor_between(u, order)) * scale
-        out = np.empty((order + 1, self.naxes, s.size))
-        for axes, system, coefficients in self._parts:
-            out[:, list(axes)] = coefficients.T @ system.taylor_between(u, order)
-        out *= scale
-        return out
-
     def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
         size = max([system.size for _, system, _ in self._parts])
-        interval = (0.0, float(self.breakpoints[1] - self.breakpoints[0]))
-        if not self.alpha:  # an interpolant of the same degree is the polynomial
-            degree = size - size % 2  # an even number of points, none of them in the middle
-        else:  # more terms than functions; as the last ones decrease fast, few of them show that they suffice
-            degree = size + 11 + size % 2 + 2 * int(self.alpha * (2.0 + size / 24.0))
-        coefficients = transform(self._jet_between(points(degree, *interval), high)[low:])
-        used = resolved_size(coefficients, tail=4) if self.alpha else degree + 1
-        return super()._segment_proxy(segment, low, high) if used is None else coefficients[..., :used]
+        # A polynomial is its own interpolant; other functions have more terms. An even number of points avoids the
+        # middle of the interval, where a waypoint often is.
+        terms = size + math.ceil(self.alpha and 8.0 + self.alpha * (2.3 + 0.16 * size))
+        u = unit_points(terms + terms % 2 - 1)
+        values = np.empty((high - low + 1, self.naxes, u.size))
+        for axes, system, coefficients in self._parts:
+            values[:, list(axes)] = coefficients.T @ system.taylor_between(u, high)[low:]
+        values *= derivative_scale(self._duration, high)[low:, None, None]
+        coefficients = transform(values)
+        if not self.alpha:
+            return coefficients[..., :terms]
+        sizes = np.abs(coefficients)
+        missed = sizes[..., -2:].max(axis=2) > _RESOLVED * sizes.max(axis=2)
+        return super()._segment_proxy(segment, low, high) if missed.any() else coefficients
 
     def _end_jet(self, segment: int, s: float, order: int) -> Array:
         # What a waypoint prescribes is not computed.
@@ -273,7 +270,8 @@ class NewtonSpline(WaypointSpline):
         given = point.jet[: order + 1]
         if len(given) > order and point.complete:
             return given
-        found = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0]
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0]
         found[: len(given)] = np.where(np.isnan(given), found[: len(given)], given)
         return found
 
@@ -346,7 +344,7 @@ def _solved(system: NewtonSystem, data: Array, times: list[float], duration: flo
 
 def _apart(times: list[float], relative: Array, duration: float) -> Array | None:
     """Differences of the normalised times, if those of the rounded times would lose digits."""
-    if np.diff(relative).min(initial=1.0) > 1e-4:
+    if min([after - before for before, after in pairwise(relative.tolist())], default=1.0) > 1e-4:
         return None
     return np.subtract.outer(times, times) / duration
 

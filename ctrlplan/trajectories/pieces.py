@@ -14,7 +14,7 @@ from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale, readonly
 from ctrlplan.trajectories.conjugate import SHORT, Kind, segment_system
 from ctrlplan.trajectories.fields import Fields
-from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, basis_proxy
+from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, basis_interpolant
 
 _AMPLIFIED = 1e4
 """Amplification of rounding errors above which each segment is fitted with a check of its accuracy."""
@@ -101,11 +101,24 @@ class Pieces(Fields):
         run = self.runs[0] if len(self.runs) == 1 else self.run(segment)
         return run.system.series_at(run.coefficients[:, :, segment - run.first].T.tolist(), u, order)
 
-    def proxy(self, segment: int, low: int, high: int) -> Array | None:
-        """Chebyshev coefficients (high - low + 1, naxes, nterms) by relative time in a segment; None if unresolved."""
-        system, coefficients = self.of_segment(segment)
-        basis = basis_proxy(system, low, high)
-        return None if basis is None else np.asarray(coefficients.T @ basis)
+    def is_resolved(self, low: int, high: int) -> bool:
+        """Whether derivatives of all segments have interpolants."""
+        return all([basis_interpolant(run.system, low, high) is not None for run in self.runs])
+
+    def rows(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
+        """Coefficients (nsegments, high - low + 1, naxes, nterms) of interpolants by relative time, if resolved."""
+        found = []
+        for run in self.runs:
+            basis = basis_interpolant(run.system, low, high)
+            if basis is not None:
+                found.append((run, basis))
+        if len(found) == 1:
+            return _rows(*found[0], segments)
+        out = np.zeros((segments.size, high - low + 1, len(self.axes), max(basis.shape[2] for _, basis in found)))
+        for run, basis in found:
+            own = (segments >= run.first) & (segments < run.last)
+            out[own, :, :, : basis.shape[2]] = _rows(run, basis, segments[own])
+        return out
 
     def at(self, segment: int, u: Value, order: int) -> list[list[Value]]:
         """Taylor series by axis at one relative time, a number or a symbol."""
@@ -224,6 +237,12 @@ def fitted(
             form.resolve(found, decimals)
         runs.append(Run(form.system, form.kind.first, found))
     return Pieces(axes, runs)
+
+
+def _rows(run: Run, basis: Array, segments: NDArray[np.intp]) -> Array:
+    """Interpolants of segments of a run, from those of the basis (norders, size, nterms)."""
+    coefficients = run.coefficients[:, :, segments - run.first].transpose(2, 1, 0)
+    return np.asarray(coefficients[:, None] @ basis)
 
 
 def _gathered(run: Run, segments: NDArray[np.intp], u: Array, order: int) -> Array:

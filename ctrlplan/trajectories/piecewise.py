@@ -22,6 +22,7 @@ from ctrlplan.trajectories.pieces import Pieces, Run, scales
 from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
 from ctrlplan.trajectories.piecewise_fit import Frame
 from ctrlplan.trajectories.polynomial import PolySpline
+from ctrlplan.trajectories.sampling import FEW, sample_segments
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
 from ctrlplan.trajectories.waypoint import Entries, Waypoint
@@ -36,8 +37,8 @@ from ctrlplan.trajectories.waypoint_spline import (
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
-_FEW, _MANY = 16, 200
-"""Number of segments up to which each is evaluated by itself, and number of times in each above which it is."""
+_FEW, _DENSE = 16, 8
+"""Number of segments up to which few times are evaluated one by one; times per segment from which all are dense."""
 
 
 class PiecewiseSpline(WaypointSpline):
@@ -392,7 +393,7 @@ class PiecewiseSpline(WaypointSpline):
             for run in pieces.runs:
                 if not run.system.hermite:
                     return False
-                weights = np.array(run.system.ranges[1:])
+                weights = run.system.higher_ranges
                 if not weights.size:
                     continue
                 sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
@@ -417,20 +418,6 @@ class PiecewiseSpline(WaypointSpline):
         out = np.empty((order + 1, self.naxes, u.size))
         for pieces in self._pieces:
             out[:, list(pieces.axes)] = pieces.jet(segment, u, order) * scale
-        return out
-
-    def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
-        duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
-        powers = duration ** -np.arange(low, high + 1.0)[:, None, None]
-        found = [pieces.proxy(segment, low, high) for pieces in self._pieces]
-        known = [proxy * powers for proxy in found if proxy is not None]
-        if len(known) < len(found):
-            return super()._segment_proxy(segment, low, high)
-        if len(known) == 1:
-            return known[0]
-        out = np.zeros((high - low + 1, self.naxes, max(proxy.shape[2] for proxy in known)))
-        for pieces, proxy in zip(self._pieces, known, strict=True):
-            out[:, list(pieces.axes), : proxy.shape[2]] = proxy
         return out
 
     def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
@@ -459,17 +446,41 @@ class PiecewiseSpline(WaypointSpline):
             rows = self._rows(float(t[0]), high, left)
             if rows is not None:
                 return np.array(rows).T[low:, :, None]
-        times, last = self.breakpoints, self.breakpoints.size - 2
-        segments = np.searchsorted(times, t, side="left" if left else "right") - 1
-        if not left:
-            segments[t == times[-1]] = last
-        inside = (segments >= 0) & (segments <= last)
-        touched = min(int(np.count_nonzero(np.diff(segments))) + 1, last + 1)
-        if touched <= _FEW or t.size > _MANY * touched or self._is_extreme(high) or not inside.all():
+        if self._is_extreme(high) or not t.size:
+            return super()._sample(t, low, high, left)
+        times = self.breakpoints
+        first, last = float(t.min()), float(t.max())
+        if not (first > times[0] if left else first >= times[0]) or not last <= times[-1]:
             return super()._sample(t, low, high, left)
         with np.errstate(over="ignore", invalid="ignore"):
-            out = self._jets(segments, t - times[segments], low, high)
+            out = self._sample_inside(t, low, high, left, (first, last))
         return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
+
+    def _sample_inside(self, t: Array, low: int, high: int, left: bool, span: tuple[float, float]) -> Array:
+        """Derivatives low to high at times of the plan, between the first and the last of them."""
+        times = self.breakpoints
+        begin, end = times[1:-1].searchsorted(span).tolist()
+        if t.size > max(FEW, _DENSE * (end - begin)) and all([p.is_resolved(low, high) for p in self._pieces]):
+            out = np.empty((high - low + 1, self.naxes, t.size))
+            entries = self._filled[:, low : high + 1].transpose(2, 1, 0)
+            sample_segments(times, lambda own: self._rows_of(own, low, high), entries, t, left, out)
+            return out
+        segments = times[1:-1].searchsorted(t, side="left" if left else "right")
+        touched = int(np.count_nonzero(segments[1:] != segments[:-1])) + 1
+        if touched <= _FEW:
+            return super()._sample(t, low, high, left)
+        return self._jets(segments, t - times[segments], low, high)
+
+    def _rows_of(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
+        """Rows (nsegments, norders * naxes, nterms) of interpolants of segments."""
+        found = [pieces.rows(segments, low, high) for pieces in self._pieces]
+        out = found[0]
+        if len(found) > 1:
+            out = np.zeros((segments.size, high - low + 1, self.naxes, max(rows.shape[3] for rows in found)))
+            for pieces, rows in zip(self._pieces, found, strict=True):
+                out[:, :, list(pieces.axes), : rows.shape[3]] = rows
+        scale = self._durations[segments, None] ** -np.arange(low, high + 1.0)
+        return (out * scale[:, :, None, None]).reshape(segments.size, -1, out.shape[3])
 
     _rows = WaypointSpline._rows  # `_sample` calls it
 
@@ -480,12 +491,17 @@ class PiecewiseSpline(WaypointSpline):
         if not is_moderate(duration, order):
             return None
         if len(self._pieces) == 1:
-            return derivatives(self._pieces[0].series_at(segment, s / duration, order), duration)
-        found: list[list[float]] = [[]] * self.naxes
-        for pieces in self._pieces:
-            rows = derivatives(pieces.series_at(segment, s / duration, order), duration)
-            for axis, row in zip(pieces.axes, rows, strict=True):
-                found[axis] = row
+            found = derivatives(self._pieces[0].series_at(segment, s / duration, order), duration)
+        else:
+            found = [[]] * self.naxes
+            for pieces in self._pieces:
+                rows = derivatives(pieces.series_at(segment, s / duration, order), duration)
+                for axis, row in zip(pieces.axes, rows, strict=True):
+                    found[axis] = row
+        if s == 0.0 or s == duration:  # what a waypoint prescribes is not computed
+            for k, entries in enumerate(self._filled[:, : order + 1, segment + (s == duration)].T.tolist()):
+                for row, value in zip(found, entries, strict=True):
+                    row[k] = row[k] if math.isnan(value) else value
         return found
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Evaluation of analytic functions at many times from exact jets at few.
+r"""Evaluation of analytic functions at many times from exact jets at few.
 
 A Chebyshev interpolant of each derivative is built from exact jets, once for a
 segment. It is evaluated by matrix products, in a basis whose functions are
@@ -27,6 +27,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 
@@ -45,6 +46,7 @@ _SHORT = 14
 _MAX_TERMS = 24
 _PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
 _CHUNK = 4104  # the functions stay in the second cache; no power of two, to avoid conflicts between rows
+_BLOCK = 16 * _CHUNK  # number of times that are grouped together
 _LARGEST = 2.0**20  # bound of all functions of the bases
 
 
@@ -66,7 +68,7 @@ class Interpolant:
     @classmethod
     def of(cls, coefficients: Array) -> Interpolant:
         """Interpolants from Chebyshev coefficients (norders, naxes, size)."""
-        rows = coefficients.reshape(-1, coefficients.shape[2]) @ _products_of_chebyshev(coefficients.shape[2])
+        rows = in_products(coefficients.reshape(-1, coefficients.shape[2]))
         return cls(readonly(rows), math.isfinite(_LARGEST * float(np.abs(rows).sum())))
 
 
@@ -104,6 +106,102 @@ def sample(
         return False
     evaluate([(interpolant.rows, 0, t.size)], t, duration, out)
     return interpolant.is_finite
+
+
+def sample_segments(
+    times: Array,
+    rows_of: Callable[[NDArray[np.intp]], Array],
+    entries: Array,
+    t: Array,
+    left: bool,
+    out: Array,
+) -> None:
+    """Derivatives at many times of few segments, by interpolants of the segments.
+
+    Parameters
+    ----------
+    times : ndarray, shape (nsegments + 1,)
+        Breakpoints [s].
+    rows_of : callable
+        Maps numbers of segments (n,) to the rows (n, norders * naxes, size) of their
+        interpolants.
+    entries : ndarray, shape (nsegments + 1, k, naxes)
+        Lowest derivatives at the breakpoints, as far as they are prescribed there;
+        others are nan. At most `norders`.
+    t : ndarray, shape (ntime,)
+        Times [s], from the first breakpoint to the last.
+    left : bool
+        Whether breakpoints belong to the segment that ends there.
+    out : ndarray, shape (norders, naxes, ntime)
+        Place of the result.
+    """
+    is_sorted = bool((t[1:] >= t[:-1]).all())
+    for begin in range(0, t.size, _BLOCK):
+        part, place = t[begin : begin + _BLOCK], out[:, :, begin : begin + _BLOCK]
+        if is_sorted:
+            _sample_grouped(times, rows_of, entries, part, left, *_groups_of_sorted(times, part, left), place)
+        else:
+            segments = _segments_of(times, part, left)
+            order = segments.astype(np.uint16 if times.size < 2**16 else np.intp).argsort(kind="stable")
+            counts = np.bincount(segments)
+            used = counts.nonzero()[0]
+            found = np.empty(place.shape)
+            _sample_grouped(times, rows_of, entries, part[order], left, used, counts[used], found)
+            place[:, :, order] = found
+
+
+def _segments_of(times: Array, t: Array, left: bool) -> NDArray[np.intp]:
+    """Segment of each time."""
+    found = times[1:-1].searchsorted(t, side="left" if left else "right")
+    return np.asarray(found)
+
+
+def _groups_of_sorted(times: Array, t: Array, left: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Segments of sorted times, and the number of times in each."""
+    first, last = _segments_of(times, t[[0, -1]], left).tolist()
+    bounds = np.empty(last - first + 2, dtype=np.intp)
+    bounds[0], bounds[-1] = 0, t.size
+    bounds[1:-1] = t.searchsorted(times[first + 1 : last + 1], side="right" if left else "left")
+    counts = bounds[1:] - bounds[:-1]
+    used = counts.nonzero()[0]
+    return used + first, counts[used]
+
+
+def _sample_grouped(
+    times: Array,
+    rows_of: Callable[[NDArray[np.intp]], Array],
+    entries: Array,
+    t: Array,
+    left: bool,
+    segments: NDArray[np.intp],
+    counts: NDArray[np.intp],
+    out: Array,
+) -> None:
+    """As `sample_segments`, at times that are grouped by segment."""
+    starts, ends = times[segments], times[segments + 1]
+    origin = starts.repeat(counts)
+    bounds = counts.cumsum().tolist()
+    parts = zip(rows_of(segments), [0, *bounds[:-1]], bounds, strict=True)
+    evaluate(parts, t - origin, (ends - starts).repeat(counts), out)
+    where = (t == (ends.repeat(counts) if left else origin)).nonzero()[0]
+    if where.size:
+        _place_entries(entries[segments.repeat(counts)[where] + left], where, out)
+    if segments[-1] == times.size - 2 and not left:  # the end belongs to the last segment
+        where = (t[bounds[-1] - counts[-1] :] == times[-1]).nonzero()[0] + (bounds[-1] - counts[-1])
+        if where.size:
+            _place_entries(entries[[-1]], where, out)
+
+
+def _place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
+    """Replace the lowest derivatives at some times by those that are known, (ntimes, k, naxes)."""
+    rows, place = known.transpose(1, 2, 0), out[: known.shape[1]]
+    free = np.isnan(rows)
+    place[:, :, where] = np.where(free, place[:, :, where], rows) if free.any() else rows
+
+
+def in_products(coefficients: Array) -> Array:
+    """Coefficients of products from Chebyshev coefficients (..., size)."""
+    return np.asarray(coefficients @ _products_of_chebyshev(coefficients.shape[-1]))
 
 
 def evaluate(parts: Iterable[tuple[Array, int, int]], t: Array, duration: Array | float, out: Array) -> None:

@@ -37,10 +37,10 @@ def warn_of_swing(values: Array, times: Array, table: Array, end: float, labels:
     remedy : str
         Advice at the end of the message.
     """
+    if within(values, table[:, 0].tolist()):
+        return
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         plan = values.max(axis=1) - values.min(axis=1)
-        if within(values, table[:, 0]):
-            return
         low, high = _data_range(times, table, end)
         # If the range is only rounding of the positions, the ratio has no meaning.
         counts = plan > 1e-9 * np.abs(values).max(axis=1)
@@ -55,10 +55,11 @@ def warn_of_swing(values: Array, times: Array, table: Array, end: float, labels:
         )
 
 
-def within(values: Array, positions: Array) -> bool:
+def within(values: Array, positions: Sequence[Sequence[float]]) -> bool:
     """Whether the ranges of a plan (naxes, ntime) exclude a swing by positions (nwaypoints, naxes) alone."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return bool((np.ptp(values, axis=1) <= MAXIMUM_SWING * np.ptp(positions, axis=0)).all())
+    highest, lowest = np.maximum.reduce(values, axis=1).tolist(), np.minimum.reduce(values, axis=1).tolist()
+    ranges = zip(highest, lowest, zip(*positions, strict=True), strict=True)
+    return all([high - low <= MAXIMUM_SWING * (max(own) - min(own)) for high, low, own in ranges])
 
 
 def _data_range(times: Array, table: Array, end: float) -> tuple[Array, Array]:

@@ -208,17 +208,52 @@ def test_one_time_next_to_horner(benchmark, capsys, kind, naxes):
         print(f"\none time, {kind}, {naxes} axes: " + "; ".join(cells))
 
 
+@pytest.mark.benchmark(group="construct")
+@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("kind", KINDS)
+def test_check_of_the_swing_next_to_construction(benchmark, capsys, kind, count):
+    """Samples of a sine with two derivatives, which no plan leaves far. Goal: at most 5 %."""
+    make = {
+        "trigonometric": lambda given, warn: TrigSpline(given, alpha=ALPHA, warn=warn),
+        "polynomial": lambda given, warn: PolySpline(given, warn=warn),
+        "piecewise": lambda given, warn: PiecewiseSpline(given, warn=warn),
+    }[kind]
+    seconds = []
+    for _ in range(200):
+        times = np.cumsum(RNG.uniform(0.7, 1.3, count))
+        given = [
+            Waypoint(t, *np.sin([[t + 0.5 * np.pi * nu, t + 2.0 + 0.5 * np.pi * nu] for nu in range(3)]))
+            for t in times.tolist()
+        ]
+        row = []
+        for warn in (False, True):
+            begin = process_time()
+            make(given, warn)
+            row.append(process_time() - begin)
+        seconds.append(row)
+    quiet, checked = (median(column) for column in zip(*seconds, strict=True))
+    benchmark.extra_info["ratio"] = checked / quiet
+    benchmark.pedantic(lambda: make(given, True), rounds=20)
+    with capsys.disabled():
+        print(f"\nswing, {kind}, {count} waypoints: {1e6 * quiet:.0f} us, with the check {checked / quiet - 1:+.1%}")
+
+
 @pytest.mark.benchmark(group="sample")
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("grid", ["uniform", "sorted"])
+@pytest.mark.parametrize("grid", ["uniform", "sorted", "unsorted"])
 def test_position_and_two_derivatives_at_some_times(benchmark, capsys, kind, grid):
-    """Peer: PPoly and its derivatives. Goals: 1.5 the first time and 1 after, 0.5 for 10,000 times."""
+    """Peer: PPoly and its derivatives. Goals: 1.5 the first time and 1 after, 0.5 for 10,000 times.
+
+    Each plan has waypoints at other times, so that nothing kept with an earlier one can help.
+    """
     cells = []
     for count in (1000, 4096, 10_000):
         quintics = PPoly.from_bernstein_basis(BPoly.from_derivatives(TIMES, JETS))
         parts = [quintics, quintics.derivative(), quintics.derivative(2)]
-        t = np.linspace(0, 10, count) if grid == "uniform" else np.sort(RNG.uniform(0, 10, count))
-        plans = [KINDS[kind](points(TIMES)) for _ in range(9)]
+        t = {"uniform": np.linspace(0, 10, count), "sorted": np.sort(RNG.uniform(0, 10, count))}.get(
+            grid, RNG.uniform(0, 10, count)
+        )
+        plans = [KINDS[kind](points(times)) for times in new_times(25)]
         exact = np.concatenate([plans[0].jet(part, 2) for part in np.array_split(t, count // 100)], axis=2)
         assert (np.abs(plans[0].jet(t, 2) - exact) <= 1e-12 * np.abs(exact).max(axis=2, keepdims=True)).all()
         times = []

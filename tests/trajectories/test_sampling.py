@@ -2,11 +2,14 @@
 
 import tracemalloc
 
+import mpmath
 import numpy as np
 import pytest
+from numpy.polynomial import chebyshev
 from trajectory_oracle import Direct, waypoints
 
-from ctrlplan.trajectories import PiecewiseSpline, PolySpline, TrigSpline, Waypoint, stack
+from ctrlplan.trajectories import PiecewiseSpline, PolySpline, TrigSpline, Waypoint, sampling, stack
+from ctrlplan.trajectories.newton import NewtonSystem
 
 # Data drawn at random and every alpha: most of these plans swing, on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
@@ -201,3 +204,118 @@ def test_memory_is_a_small_multiple_of_the_result(segments, name):
     tracemalloc.stop()
     assert result.shape == (3, 2, t.size)
     assert peak <= 2.5 * result.nbytes
+
+
+# The parts of which interpolants are made
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 12, 25, 33, 64, 129])
+def test_products_are_chebyshev_polynomials(size):
+    """Against numpy's Clenshaw recurrence, for random series and for each polynomial alone, at both ends as well."""
+    t = np.append(np.random.default_rng(size).uniform(0.0, 5.0, 300), [0.0, 2.5, 5.0])
+    series = np.concatenate([np.random.default_rng(1).normal(size=(3, size)), np.eye(size)])
+    out = np.empty((len(series), 1, t.size))
+    sampling.evaluate([(sampling.in_products(series), 0, t.size)], t, 5.0, out)
+    exact = chebyshev.chebval(t / 2.5 - 1.0, series.T)
+    # Rounding of x and of each square, multiplied by the derivative of the polynomials, at most size^2.
+    assert (np.abs(out[:, 0] - exact) <= 4 * EPS * size**2 * np.abs(series).sum(axis=1)[:, None]).all()
+    assert sampling.Interpolant.of(series[:, None]).is_finite
+    with np.errstate(over="ignore"):
+        assert not sampling.Interpolant.of(series[:, None] + 1e308).is_finite
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1e-9, 0.7, 3.0, 2 * np.pi])
+def test_functions_between_nodes_in_fifty_digits(alpha):
+    """Products of sines and cosines, differentiated by mpmath; near a node as well."""
+    times, given = np.array([0.0, 0.3, 1.0]), ((0, 1, 2), (0,), (0, 1))
+    system = NewtonSystem(alpha, times, given)
+    nodes = system._nodes.tolist()
+    u = np.array([1e-9, 0.21, 0.3 + 1e-7, 0.8, 1.0 - 1e-4])
+    with mpmath.workdps(50):
+        half = mpmath.mpf(alpha) / 2
+
+        def function(k, at):
+            def angle(i):
+                return at - mpmath.mpf(nodes[i])
+
+            product = mpmath.mpf(1)
+            for i in range(k):
+                product *= mpmath.sin(half * angle(i)) / half if alpha else angle(i)
+            return product * (mpmath.cos(half * angle(k)) if k % 2 else 1)
+
+        exact = [
+            [mpmath.taylor(lambda at, k=k: function(k, at), mpmath.mpf(v), 3) for v in u.tolist()]
+            for k in range(system.size)
+        ]
+    exact = np.array(exact, dtype=float).transpose(2, 0, 1)
+    for order in range(4):
+        found = system.taylor_between(u, order)
+        assert found.shape == (order + 1, system.size, u.size)
+        size = np.abs(exact[: order + 1]).max(axis=2, keepdims=True)
+        assert (np.abs(found - exact[: order + 1]) <= 20 * EPS * size).all()
+
+
+def test_functions_at_nodes_and_of_high_orders_are_those_of_all_times():
+    system = NewtonSystem(1.0, np.array([0.0, 0.5, 1.0]), ((0, 1), (0, 1), (0, 1)))
+    for u, order in ((np.array([0.2, 0.5]), 2), (np.array([0.2, 0.7]), 5)):
+        np.testing.assert_array_equal(system.taylor_between(u, order), system.taylor(u, order).transpose(1, 0, 2))
+
+
+ENDS = {
+    "polynomial": lambda points: PolySpline(points),
+    "trigonometric": lambda points: TrigSpline(points, alpha=2.3),
+    "nearly closed": lambda points: TrigSpline(points, alpha=6.2),
+    "piecewise": lambda points: PiecewiseSpline(points),
+    "piecewise trigonometric": lambda points: PiecewiseSpline(points, alpha=1.7),
+}
+
+
+@pytest.mark.parametrize("kind", ENDS)
+def test_ends_have_the_entries_of_waypoints_in_every_bit(kind):
+    """Whatever the way of calling, also where an entry is free."""
+    rng = np.random.default_rng(11)
+    jets = rng.normal(size=(3, 3, 2))
+    jets[0, 1, 0] = jets[2, 2, 1] = np.nan
+    plan = ENDS[kind]([Waypoint(float(t), *jet) for t, jet in zip([0.3, 1.0, 2.1], jets, strict=True)])
+    t = np.linspace(plan.start, plan.end, 1001)
+    for k, end in ((0, plan.start), (-1, plan.end)):
+        for found in (plan.jet(end, 2), plan.jet([end], 2)[..., 0], plan.jet(t, 2)[..., k]):
+            assert ((found == jets[k]) | np.isnan(jets[k])).all()
+        assert np.abs(plan.jet(end, 4) - plan.jet(t, 4)[..., k]).max() <= 1e-11 * np.abs(plan.jet(t, 4)).max()
+        nearby = plan.jet(end + (1e-9 if k == 0 else -1e-9), 2)
+        slack = 1e-12 * np.abs(plan.jet(t, 2)).max(axis=2) + 2e-9 * np.abs(plan.jet(t, 3)[1:]).max(axis=2)
+        assert (np.abs(plan.jet(end, 2) - nearby) <= slack).all()
+
+
+def times_of_segments(plan, count, rng):
+    """Times that are hard to assign to segments."""
+    marks, inside = plan.breakpoints, rng.uniform(plan.start, plan.end, count)
+    return {
+        **orders_of(plan, count, rng),
+        "at breakpoints": rng.choice(marks, count),
+        "sorted at breakpoints": np.sort(rng.choice(marks, count)),
+        "next to breakpoints": np.nextafter(rng.choice(marks[1:], count), -np.inf),
+        "one breakpoint": np.full(count, marks[marks.size // 2]),
+        "descending": np.sort(inside)[::-1],
+        "repeated": np.repeat(inside[: count // 5], 5),
+        "one segment": np.linspace(marks[1], marks[2], count),
+        "outside": rng.uniform(plan.start - 1.0, plan.end + 1.0, count),
+    }
+
+
+@pytest.mark.parametrize("alpha", [0.0, 2.0])
+@pytest.mark.parametrize("count", [300, 2000, pytest.param(70_000, marks=pytest.mark.slow)])
+def test_a_piecewise_spline_at_many_times_and_at_each(count, alpha):
+    """Some entries are free on one axis, so that there are several groups of functions."""
+    rng = np.random.default_rng(12)
+    jets = rng.normal(size=(9, 3, 3))
+    jets[4, 1:, 1] = jets[6, 2, 2] = jets[0, 2, 1] = np.nan
+    marks = np.cumsum(rng.uniform(0.2, 1.0, 9)) - 2.0
+    plan = PiecewiseSpline([Waypoint(t, *jet) for t, jet in zip(marks.tolist(), jets, strict=True)], alpha=alpha)
+    peaks = np.array([plan.peak(nu) for nu in range(5)])
+    for name, t in times_of_segments(plan, count, rng).items():
+        for left in (False, True):
+            found = plan.jet(t, 3, left)
+            for i in rng.choice(count, 12):
+                exact = plan.jet(float(t[i]), 3, left)
+                assert (np.abs(found[:, :, i] - exact) <= 1e-12 * peaks[:4]).all(), (name, left, t[i])
