@@ -9,6 +9,7 @@ precision, or the equations are solved in decimal arithmetic.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,6 +30,9 @@ _ACCURATE = 1e-12
 
 _ACCEPTED = 1e-9
 """The same for many entries, for which decimal arithmetic is slow, and for closed plans, for which there is none."""
+
+_SEARCHED = 1e-10
+"""Estimated relative error of costs above which a search over times uses more digits."""
 
 _SINGULAR = 1e13
 """Condition number of their equations, for equal durations, above which they are not determined."""
@@ -246,14 +250,26 @@ class FreeEntries:
         Period of a closed plan.
     """
 
+    _moments: Array | None  # ends of the segments; None for durations that are exact
+
     def __init__(self, pattern: FreePattern, times: Array, period: float | None = None) -> None:
-        self.pattern, self._times = pattern, times
-        self._moments = times if period is None else np.append(times, times[0] + period)
-        self._durations = durations = np.diff(self._moments)
-        self._units = np.empty(times.size)
+        self._moments = moments = times if period is None else np.append(times, times[0] + period)
+        self._set(pattern, moments[1:] - moments[:-1])
+
+    @classmethod
+    def of_durations(cls, pattern: FreePattern, durations: Array) -> FreeEntries:
+        """Equations for exact durations (nsegments,) [s], of a plan that is not closed."""
+        self = cls.__new__(cls)
+        self._moments = None
+        self._set(pattern, durations)
+        return self
+
+    def _set(self, pattern: FreePattern, durations: Array) -> None:
+        self.pattern, self._durations = pattern, durations
+        self._units = np.empty(pattern.count)
         np.minimum(durations[:-1], durations[1:], out=self._units[1 : durations.size])
-        self._units[0] = durations[0] if period is None else min(durations[0], durations[-1])
-        if period is None:
+        self._units[0] = min(durations[0], durations[-1]) if pattern.closed else durations[0]
+        if not pattern.closed:
             self._units[-1] = durations[-1]
         self._ratio = float(durations.max() / durations.min())
 
@@ -287,10 +303,16 @@ class FreeEntries:
         raise ValueError("free entries at waypoints must be determined by the prescribed ones; prescribe more")
 
     def estimate(self, rows: Array) -> Array:
-        """The same to about nine digits, for a search over times."""
+        """The same for a search over times, without the digits that only the coefficients of short segments need."""
         equations = self._equations
-        if equations is not None and equations.loss <= _ACCEPTED:
-            return self._checked(self._plain(equations, rows))
+        if equations is not None:
+            # Costs of a short segment are differences of its entries.
+            if equations.loss * self._ratio**self.pattern.size <= _SEARCHED:
+                return self._checked(self._plain(equations, rows))
+            if _EXTENDED and not self.pattern.alpha and self._determined(equations):
+                found = self._refined(equations, rows, 1e-15)
+                if found is not None:
+                    return self._checked(found.astype(float))
         return self.solve(rows).astype(float)
 
     @property
@@ -323,7 +345,8 @@ class FreeEntries:
         """Solution with residuals in extended precision; None if it does not converge to a relative tolerance."""
         long, orders = np.longdouble, self.pattern.orders
         offset, shifted = self._shifted(rows.astype(long))
-        durations, units = np.diff(self._moments.astype(long)), self._units.astype(long)
+        durations = self._durations.astype(long) if self._moments is None else np.diff(self._moments.astype(long))
+        units = self._units.astype(long)
         every = [
             [(n, slice(0, kind.last - kind.first)) for n in range(kind.orders.size)] for kind in self.pattern.kinds
         ]
@@ -350,12 +373,17 @@ class FreeEntries:
         if even is None or even.condition <= _SINGULAR or pattern.alpha > NEARLY_CLOSED:
             ends = [kind.ends for kind in pattern.kinds for _ in range(kind.first, kind.last)]
             free = list(zip(pattern.nodes.tolist(), pattern.orders.tolist(), strict=True))
-            solution = conjugate_digits(pattern.alpha, self._times.tolist(), ends, free, rows.T)
+            solution = conjugate_digits(pattern.alpha, self._exact_durations(), ends, free, rows.T)
         if solution is None:
             raise ValueError(
                 "free entries at inner waypoints must be determined by the prescribed ones; prescribe more"
             )
         return self._checked(solution.T)
+
+    def _exact_durations(self) -> list[Fraction]:
+        if self._moments is None:
+            return [Fraction(h) for h in self._durations.tolist()]
+        return [Fraction(end) - Fraction(start) for start, end in itertools.pairwise(self._moments.tolist())]
 
     def _checked(self, found: NDArray[Any]) -> NDArray[Any]:
         finite = np.isfinite(found.astype(float, copy=False))
