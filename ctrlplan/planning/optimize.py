@@ -33,7 +33,7 @@ from ctrlplan._checks import checked_count, checked_finite, checked_labels
 from ctrlplan._display import Displayed, Facts, Figure, Part, counted, number, title_of
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.chosen import checked_alpha
-from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, readonly, times_powers
 from ctrlplan.trajectories.conjugate import FreeEntries, FreePattern
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.piecewise_fit import alike
@@ -202,7 +202,7 @@ def optimize_waypoints(
     table[:, :rows] = given.table[:, :rows]
     if np.isnan(table).all(axis=(0, 1)).any():
         raise ValueError("every axis must have a prescribed entry, got an axis with none")
-    unit = duration ** np.arange(order + 1)[:, None]
+    unit = times_powers(np.ones((order + 1, 1)), duration, np.arange(order + 1)[:, None])
     problem = _Problem(table * unit, continuity, alpha, derivative, single)
     found = problem.solve(relative)
     if free_times and len(points) > 2:
@@ -211,6 +211,7 @@ def optimize_waypoints(
         better = problem.solve(np.diff(chosen) / duration)
         if better.cost @ factors < found.cost @ factors:
             found, times = better, chosen
+    cost = _cost(found, factors, duration, derivative)
     error = _relative_error(problem, np.diff(times) / duration, found)
     if error > _FEW and problem.is_minimal() and problem.has_digits(np.diff(times) / duration):
         return _resolved(Entries(times, readonly(table), np.full(len(points), order + 1), names), derivative, factors)
@@ -231,7 +232,6 @@ def optimize_waypoints(
         plan = PiecewiseSpline.of_entries(after, alpha)
     shared = readonly(np.where(split, np.nan, sides[1]))
     chosen_points = Entries(times, shared, count, names).waypoints()
-    cost = float(found.cost @ factors) * duration ** (1 - 2 * derivative)
     return Optimum(chosen_points, plan, cost, found.unique, derivative)
 
 
@@ -248,6 +248,18 @@ def _resolved(entries: Entries, derivative: int, factors: Array) -> Optimum:
     filled = np.where(np.isnan(entries.table), jets, entries.table)
     points = Entries(entries.times, readonly(filled), entries.counts, entries.labels).waypoints()
     return Optimum(points, plan, float(np.sum(costs, axis=0) @ factors), True, derivative)
+
+
+def _cost(found: _Solution, factors: Array, duration: float, derivative: int) -> float:
+    """Cost in the units of the plan."""
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        cost = float(found.cost @ factors * np.float64(duration) ** (1 - 2 * derivative))
+    if not math.isfinite(cost):
+        raise ValueError(
+            f"the cost must stay within floating point, got an overflow for entries over {duration:g} s; "
+            "choose other units"
+        )
+    return cost
 
 
 def _relative_error(problem: _Problem, durations: Array, found: _Solution) -> float:
@@ -338,8 +350,9 @@ class _Problem:
 
     def solve(self, durations: Array, estimate: bool = False) -> _Solution:
         """Minimum cost at relative durations; an estimate for a search has about nine digits."""
-        family = self.family(durations, *self.shape)
-        found = [family.solve(group, estimate) for group in self.groups]
+        with np.errstate(over="ignore", invalid="ignore"):
+            family = self.family(durations, *self.shape)
+            found = [family.solve(group, estimate) for group in self.groups]
         if len(found) == 1:
             return found[0]
         naxes, _, count = self.rows.shape

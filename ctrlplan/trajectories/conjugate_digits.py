@@ -38,7 +38,7 @@ def conjugate_digits(
     alpha : float
         Shape parameter [rad] of each segment; 0 gives polynomials.
     durations : sequence of Fraction, of length nsegments
-        Exact durations of the segments [s].
+        Exact durations of the segments [s]; of a closed plan as many as waypoints.
     ends : sequence of Ends, of length nsegments
         Orders that determine each segment, free entries included.
     free : sequence of (int, int)
@@ -73,11 +73,11 @@ def _jump(
     table: Array,
 ) -> _Row:
     """Equation of a free entry: continuity of its conjugate derivative."""
-    i, k = entry
+    i, k = entry  # segment -1 is the last one of a closed plan
     order = 2 * table.shape[1] - 1 - k
     unknown, known = dict[int, Decimal](), [Decimal(0)] * table.shape[2]
     for segment, side in ((i - 1, 1), (i, 0)):
-        data = [(segment + end, given) for end in (0, 1) for given in ends[segment][end]]
+        data = [((segment + end) % len(table), given) for end in (0, 1) for given in ends[segment][end]]
         for (waypoint, given), weight in zip(data, weights[segment][side][order], strict=True):
             factor = weight * steps[segment] ** (given - order) * (1 - 2 * side)
             n = place.get((waypoint, given))
