@@ -205,13 +205,14 @@ def optimize_waypoints(
     unit = times_powers(np.ones((order + 1, 1)), duration, np.arange(order + 1)[:, None])
     problem = _Problem(table * unit, continuity, alpha, derivative, single)
     found = problem.solve(relative)
+    cost = _cost(found, factors, duration, derivative)
     if free_times and len(points) > 2:
         chosen = start + duration * _times(_best_durations(problem, relative, found, factors))
         chosen[[0, -1]] = times[[0, -1]]
         better = problem.solve(np.diff(chosen) / duration)
         if better.cost @ factors < found.cost @ factors:
             found, times = better, chosen
-    cost = _cost(found, factors, duration, derivative)
+            cost = _cost(found, factors, duration, derivative)
     error = _relative_error(problem, np.diff(times) / duration, found)
     if error > _FEW and problem.is_minimal() and problem.has_digits(np.diff(times) / duration):
         return _resolved(Entries(times, readonly(table), np.full(len(points), order + 1), names), derivative, factors)
