@@ -33,7 +33,7 @@ from ctrlplan._checks import checked_count, checked_finite, checked_labels
 from ctrlplan._display import Displayed, Facts, Figure, Part, counted, number, title_of
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.chosen import checked_alpha
-from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, readonly, times_powers
 from ctrlplan.trajectories.conjugate import FreeEntries, FreePattern
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.piecewise_fit import alike
@@ -196,22 +196,24 @@ def optimize_waypoints(
 
     times = given.times
     start, duration = points[0].time, checked_finite(points[-1].time - points[0].time, "duration", above=0.0)
-    relative = (times - start) / duration
+    relative = np.diff(times) / duration
     table = np.full((len(points), order + 1, naxes), np.nan)
     rows = min(order + 1, given.table.shape[1])
     table[:, :rows] = given.table[:, :rows]
     if np.isnan(table).all(axis=(0, 1)).any():
         raise ValueError("every axis must have a prescribed entry, got an axis with none")
-    unit = duration ** np.arange(order + 1)[:, None]
+    unit = times_powers(np.ones((order + 1, 1)), duration, np.arange(order + 1)[:, None])
     problem = _Problem(table * unit, continuity, alpha, derivative, single)
     found = problem.solve(relative)
+    cost = _cost(found, factors, duration, derivative)
     if free_times and len(points) > 2:
-        chosen = start + duration * _best_times(problem, relative, found, factors)
+        chosen = start + duration * _times(_best_durations(problem, relative, found, factors))
         chosen[[0, -1]] = times[[0, -1]]
-        better = problem.solve((chosen - start) / duration)
+        better = problem.solve(np.diff(chosen) / duration)
         if better.cost @ factors < found.cost @ factors:
             found, times = better, chosen
-    error = _relative_error(problem, (times - start) / duration, found)
+            cost = _cost(found, factors, duration, derivative)
+    error = _relative_error(problem, np.diff(times) / duration, found)
     if error > _FEW and problem.is_minimal() and problem.has_digits(np.diff(times) / duration):
         return _resolved(Entries(times, readonly(table), np.full(len(points), order + 1), names), derivative, factors)
     _check_digits(problem, error, times)
@@ -231,7 +233,6 @@ def optimize_waypoints(
         plan = PiecewiseSpline.of_entries(after, alpha)
     shared = readonly(np.where(split, np.nan, sides[1]))
     chosen_points = Entries(times, shared, count, names).waypoints()
-    cost = float(found.cost @ factors) * duration ** (1 - 2 * derivative)
     return Optimum(chosen_points, plan, cost, found.unique, derivative)
 
 
@@ -250,7 +251,19 @@ def _resolved(entries: Entries, derivative: int, factors: Array) -> Optimum:
     return Optimum(points, plan, float(np.sum(costs, axis=0) @ factors), True, derivative)
 
 
-def _relative_error(problem: _Problem, times: Array, found: _Solution) -> float:
+def _cost(found: _Solution, factors: Array, duration: float, derivative: int) -> float:
+    """Cost in the units of the plan."""
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        cost = float(found.cost @ factors * np.float64(duration) ** (1 - 2 * derivative))
+    if not math.isfinite(cost):
+        raise ValueError(
+            f"the cost must stay within floating point, got an overflow for entries over {duration:g} s; "
+            "choose other units"
+        )
+    return cost
+
+
+def _relative_error(problem: _Problem, durations: Array, found: _Solution) -> float:
     """Estimated relative error of the cost by rounding of the data."""
     position, higher = problem.table[:, 0], np.nan_to_num(problem.table[:, 1:])
     size = np.nanmax(np.abs(position), axis=0, initial=0.0)
@@ -259,7 +272,7 @@ def _relative_error(problem: _Problem, times: Array, found: _Solution) -> float:
     data = ranges**2 + (higher**2).sum(axis=(0, 1))
     # A cost of 0 is attained up to rounding, relative to that of other plans through similar data.
     floor = np.maximum(found.cost, 1e-6 * data)
-    return float(np.divide(problem.rounding(times, found), floor, where=data > 0.0, out=0.0 * data).max())
+    return float(np.divide(problem.rounding(durations, found), floor, where=data > 0.0, out=0.0 * data).max())
 
 
 def _check_digits(problem: _Problem, error: float, times: Array) -> None:
@@ -336,10 +349,11 @@ class _Problem:
         """Entries that are free on each side separately, shape (nwaypoints, order + 1, naxes)."""
         return np.isnan(self.table) & self.loose[:, :, None]
 
-    def solve(self, times: Array, estimate: bool = False) -> _Solution:
-        """Minimum cost at relative times; an estimate for a search has about nine digits."""
-        family = self.family(times, *self.shape)
-        found = [family.solve(group, estimate) for group in self.groups]
+    def solve(self, durations: Array, estimate: bool = False) -> _Solution:
+        """Minimum cost at relative durations; an estimate for a search has about nine digits."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            family = self.family(durations, *self.shape)
+            found = [family.solve(group, estimate) for group in self.groups]
         if len(found) == 1:
             return found[0]
         naxes, _, count = self.rows.shape
@@ -348,26 +362,25 @@ class _Problem:
             sides[:, group.axes], cost[group.axes], slope[group.axes] = part.sides, part.cost, part.slope
         return _Solution((sides[0], sides[1]), cost, slope, all(part.unique for part in found))
 
-    def rounding(self, times: Array, found: _Solution) -> Array:
+    def rounding(self, durations: Array, found: _Solution) -> Array:
         """Estimate (naxes,) of the error of the cost."""
-        return self.family(times, *self.shape).rounding(found)
+        return self.family(durations, *self.shape).rounding(found)
 
-    def scale(self, times: Array) -> Array:
+    def scale(self, durations: Array) -> Array:
         """Cost (naxes,) of entries of these magnitudes without cancellation: free ones 0, alternating signs."""
         entries = np.abs(np.nan_to_num(self.rows))
         entries[:, :, 1::2] *= -1.0
         group = self._group(np.arange(len(entries)), np.ones(self.table.shape[:2], dtype=bool), entries)
-        return self.family(times, *self.shape).solve(group).cost
+        return self.family(durations, *self.shape).solve(group).cost
 
 
 class _Segments:
     """One spline per segment."""
 
-    def __init__(self, times: Array, alpha: float, order: int, derivative: int) -> None:
+    def __init__(self, durations: Array, alpha: float, order: int, derivative: int) -> None:
         self.root = _segment_root(alpha, order, derivative)
         self.derivative = derivative
-        self.times = times
-        self.durations = times[1:] - times[:-1]
+        self.durations = durations
         self.orders = np.tile(np.arange(order + 1), 2)
         powers = [np.ones_like(self.durations)]
         while len(powers) <= order:
@@ -403,7 +416,7 @@ class _Segments:
             return group.rows
         if group.pattern is None:
             return None
-        free = FreeEntries(group.pattern, self.times)
+        free = FreeEntries.of_durations(group.pattern, self.durations)
         try:
             found = free.estimate(group.rows) if estimate else free.solve(group.rows)
         except ValueError:  # a minimum-norm solution is found by the dense equations
@@ -436,7 +449,8 @@ class _Segments:
 class _Whole:
     """One spline through all waypoints."""
 
-    def __init__(self, times: Array, alpha: float, order: int, derivative: int) -> None:
+    def __init__(self, durations: Array, alpha: float, order: int, derivative: int) -> None:
+        times = _times(durations)
         given = (tuple(range(order + 1)),) * times.size
         self.system = NewtonSystem(alpha, times, given)
         self.samples = self.system.squared_samples(derivative)
@@ -535,17 +549,16 @@ def _norms(matrix: Array) -> Array:
     return np.where(norms > 0.0, norms, 1.0)
 
 
-def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Array) -> Array:
-    """Relative times of minimum cost from several starts."""
+def _best_durations(problem: _Problem, given: Array, first: _Solution, weights: Array) -> Array:
+    """Relative durations of minimum cost from several starts."""
     # Costs below this are rounding, of which the logarithm has no meaning.
     floor = 1e-26 * float(problem.scale(given) @ weights)
     if first.cost @ weights <= floor:
         return given
-    segments = np.diff(given)
-    minimum = min(1e-4 / segments.size, 0.5 * float(segments.min()))
-    room = 1.0 - segments.size * minimum
+    minimum = min(1e-4 / given.size, 0.5 * float(given.min()))
+    room = 1.0 - given.size * minimum
     chord = np.sqrt(weights @ np.diff(first.sides[1][:, 0]) ** 2)
-    chord = chord / chord.max() if chord.any() else np.ones(segments.size)
+    chord = chord / chord.max() if chord.any() else np.ones(given.size)
     best: list[tuple[float, Array]] = []  # cost and logarithms of the durations of minima
 
     def shares(x: Array) -> Array:
@@ -554,7 +567,7 @@ def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Arra
 
     def objective(x: Array) -> tuple[float, Array]:
         share = shares(x)
-        found = problem.solve(_times(minimum + room * share), estimate=True)
+        found = problem.solve(minimum + room * share, estimate=True)
         cost, slope = float(found.cost @ weights) + floor, room * share * (weights @ found.slope)
         return math.log(cost), (slope - share * slope.sum()) / cost
 
@@ -565,7 +578,7 @@ def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Arra
             if intermediate_result.fun >= cost and np.abs(logarithms - known).max() < _NEAR:
                 raise StopIteration
 
-    starts = [segments, *(chord**power for power in (1.0, 0.5, 1.0 / 3.0, 0.0))]
+    starts = [given, *(chord**power for power in (1.0, 0.5, 1.0 / 3.0, 0.0))]
     shorts = [np.maximum(start / start.sum(), 2.0 * minimum) for start in starts]
     logs = [np.log(h / h.sum() - minimum) for h in shorts]
     for x in sorted(logs, key=lambda x: objective(x)[0]):
@@ -573,7 +586,7 @@ def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Arra
         result = minimize(objective, x, jac=True, method="L-BFGS-B", callback=stop_near_known, options=_LIMITED_MEMORY)
         best.append((float(result.fun), np.log(shares(result.x))))
     chosen = min(best, key=lambda pair: pair[0])[1]
-    return _times(minimum + room * np.exp(chosen))
+    return minimum + room * np.exp(chosen)
 
 
 def _times(durations: Array) -> Array:

@@ -9,6 +9,7 @@ precision, or the equations are solved in decimal arithmetic.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +29,10 @@ _ACCURATE = 1e-12
 """Estimated relative error of the free entries above which more digits are used."""
 
 _ACCEPTED = 1e-9
-"""The same for many entries, for which decimal arithmetic is slow, and for closed plans, for which there is none."""
+"""The same for many entries, for which decimal arithmetic is slow."""
+
+_SEARCHED = 1e-10
+"""Estimated relative error of costs above which a search over times uses more digits."""
 
 _SINGULAR = 1e13
 """Condition number of their equations, for equal durations, above which they are not determined."""
@@ -36,14 +40,14 @@ _SINGULAR = 1e13
 _UNEVEN = 1e3
 """Ratio of durations, to the power of the number of orders, above which rounding of the entries matters."""
 
-_ALIKE = 10.0
-"""Ratio of durations up to which they are of one size."""
-
 _SUSPECT = 1e8
 """Condition number above which equations may not determine the entries."""
 
 SHORT = 0.02
 """Duration relative to the longest segment below which entries and coefficients are computed with more digits."""
+
+_ALIKE = 1.0 / SHORT
+"""Ratio of durations up to which they are of one size, so that 13 digits of many entries suffice."""
 
 _DECIMALS = 400
 """Number of free entries up to which decimal arithmetic is preferred to extended precision."""
@@ -136,11 +140,11 @@ class FreePattern:
 
     def __init__(self, alpha: float, given: NDArray[np.bool_], closed: bool, natural: bool = False) -> None:
         self.alpha, self.given, self.closed = alpha, given, closed
-        self.open = not closed and not natural
+        self.natural = natural
         self.count, self.size = given.shape
         self.kinds = kinds_of(np.ones_like(given) if natural else given, closed)
         free = ~given
-        if self.open:
+        if not closed and not natural:
             free[[0, -1]] = False
         rank = np.argsort(_folded(self.count)) if closed else np.arange(self.count)
         ordered = np.argsort(rank, kind="stable")
@@ -155,6 +159,14 @@ class FreePattern:
         """Place of each equation among the jumps of an axis."""
         self.prescribed = [self._prescribed(kind) for kind in self.kinds]
         self.first_position = int(given[:, 0].argmax()) if given[:, 0].any() else None
+
+    @property
+    def undetermined(self) -> str:
+        """Message for entries that are not determined."""
+        where = "waypoints" if self.closed else "inner waypoints"
+        got = "" if self.given[:, 0].any() else ", got an axis without any prescribed position"
+        ends = "" if self.closed else ", such as derivatives at the first and last waypoint"
+        return f"free entries at {where} must be determined by the prescribed ones{got}; prescribe more{ends}"
 
     def _prescribed(self, kind: Kind) -> list[tuple[int, slice]]:
         """Entries of a kind of segments, and the segments from the first to the last in which each is prescribed."""
@@ -246,14 +258,26 @@ class FreeEntries:
         Period of a closed plan.
     """
 
+    _moments: Array | None  # ends of the segments; None for durations that are exact
+
     def __init__(self, pattern: FreePattern, times: Array, period: float | None = None) -> None:
-        self.pattern, self._times = pattern, times
-        self._moments = times if period is None else np.append(times, times[0] + period)
-        self._durations = durations = np.diff(self._moments)
-        self._units = np.empty(times.size)
+        self._moments = moments = times if period is None else np.append(times, times[0] + period)
+        self._set(pattern, moments[1:] - moments[:-1])
+
+    @classmethod
+    def of_durations(cls, pattern: FreePattern, durations: Array) -> FreeEntries:
+        """Equations for exact durations (nsegments,) [s], of a plan that is not closed."""
+        self = cls.__new__(cls)
+        self._moments = None
+        self._set(pattern, durations)
+        return self
+
+    def _set(self, pattern: FreePattern, durations: Array) -> None:
+        self.pattern, self._durations = pattern, durations
+        self._units = np.empty(pattern.count)
         np.minimum(durations[:-1], durations[1:], out=self._units[1 : durations.size])
-        self._units[0] = durations[0] if period is None else min(durations[0], durations[-1])
-        if period is None:
+        self._units[0] = min(durations[0], durations[-1]) if pattern.closed else durations[0]
+        if not pattern.closed:
             self._units[-1] = durations[-1]
         self._ratio = float(durations.max() / durations.min())
 
@@ -266,8 +290,8 @@ class FreeEntries:
             If the prescribed entries do not determine them, or they overflow.
         """
         pattern = self.pattern
-        open_, few = pattern.open, pattern.nodes.size <= _DECIMALS
-        if open_ and few and self._ratio * SHORT > 1.0:
+        few = pattern.nodes.size <= _DECIMALS and not pattern.natural
+        if few and self._ratio * SHORT > 1.0:
             return self._decimal(rows)
         equations = self._equations
         if equations is not None:
@@ -275,22 +299,27 @@ class FreeEntries:
             if equations.loss <= _ACCURATE and not (self._uneven and extended):
                 return self._checked(self._plain(equations, rows))
             if extended and self._determined(equations):
-                # With durations of one size all entries have one scale.
-                loose = self._ratio <= _ALIKE and not (open_ and few)
+                loose = self._ratio <= _ALIKE and not few
                 found = self._refined(equations, rows, 1e-13 if loose else 1e-15)
                 if found is not None:
                     return self._checked(found)
-            elif not extended and equations.loss <= _ACCEPTED and not (open_ and few):
+            elif not extended and equations.loss <= _ACCEPTED and not few:
                 return self._checked(self._plain(equations, rows))
-        if open_:
+        if not pattern.natural:
             return self._decimal(rows)
-        raise ValueError("free entries at waypoints must be determined by the prescribed ones; prescribe more")
+        raise ValueError(pattern.undetermined)
 
     def estimate(self, rows: Array) -> Array:
-        """The same to about nine digits, for a search over times."""
+        """The same for a search over times, without the digits that only the coefficients of short segments need."""
         equations = self._equations
-        if equations is not None and equations.loss <= _ACCEPTED:
-            return self._checked(self._plain(equations, rows))
+        if equations is not None:
+            # Costs of a short segment are differences of its entries.
+            if equations.loss * self._ratio**self.pattern.size <= _SEARCHED:
+                return self._checked(self._plain(equations, rows))
+            if _EXTENDED and not self.pattern.alpha and self._determined(equations):
+                found = self._refined(equations, rows, 1e-15)
+                if found is not None:
+                    return self._checked(found.astype(float))
         return self.solve(rows).astype(float)
 
     @property
@@ -323,7 +352,8 @@ class FreeEntries:
         """Solution with residuals in extended precision; None if it does not converge to a relative tolerance."""
         long, orders = np.longdouble, self.pattern.orders
         offset, shifted = self._shifted(rows.astype(long))
-        durations, units = np.diff(self._moments.astype(long)), self._units.astype(long)
+        durations = self._durations.astype(long) if self._moments is None else np.diff(self._moments.astype(long))
+        units = self._units.astype(long)
         every = [
             [(n, slice(0, kind.last - kind.first)) for n in range(kind.orders.size)] for kind in self.pattern.kinds
         ]
@@ -347,15 +377,19 @@ class FreeEntries:
         """Solution in decimal arithmetic."""
         pattern, even = self.pattern, self._even
         solution = None
-        if even is None or even.condition <= _SINGULAR or pattern.alpha > NEARLY_CLOSED:
+        apart = pattern.alpha > NEARLY_CLOSED and not pattern.closed
+        if even is None or even.condition <= _SINGULAR or apart:
             ends = [kind.ends for kind in pattern.kinds for _ in range(kind.first, kind.last)]
             free = list(zip(pattern.nodes.tolist(), pattern.orders.tolist(), strict=True))
-            solution = conjugate_digits(pattern.alpha, self._times.tolist(), ends, free, rows.T)
+            solution = conjugate_digits(pattern.alpha, self._exact_durations(), ends, free, rows.T)
         if solution is None:
-            raise ValueError(
-                "free entries at inner waypoints must be determined by the prescribed ones; prescribe more"
-            )
+            raise ValueError(pattern.undetermined)
         return self._checked(solution.T)
+
+    def _exact_durations(self) -> list[Fraction]:
+        if self._moments is None:
+            return [Fraction(h) for h in self._durations.tolist()]
+        return [Fraction(end) - Fraction(start) for start, end in itertools.pairwise(self._moments.tolist())]
 
     def _checked(self, found: NDArray[Any]) -> NDArray[Any]:
         finite = np.isfinite(found.astype(float, copy=False))
@@ -364,7 +398,7 @@ class FreeEntries:
             raise ValueError(
                 "derivatives at inner waypoints must stay within floating point, got an overflow of derivative "
                 f"{self.pattern.orders[worst]} at waypoints[{self.pattern.nodes[worst]}]; increase the time between "
-                "neighbouring waypoints"
+                "neighbouring waypoints, or choose other units"
             )
         return found
 

@@ -13,6 +13,7 @@ import math
 import operator
 from collections.abc import Sequence
 from decimal import Decimal
+from fractions import Fraction
 from functools import lru_cache
 
 import numpy as np
@@ -28,7 +29,7 @@ _Row = tuple[dict[int, Decimal], list[Decimal]]
 
 
 def conjugate_digits(
-    alpha: float, times: Sequence[float], ends: Sequence[Ends], free: Sequence[tuple[int, int]], table: Array
+    alpha: float, durations: Sequence[Fraction], ends: Sequence[Ends], free: Sequence[tuple[int, int]], table: Array
 ) -> NDArray[np.object_] | None:
     """Free entries for continuous conjugate derivatives, correct to rounding.
 
@@ -36,8 +37,8 @@ def conjugate_digits(
     ----------
     alpha : float
         Shape parameter [rad] of each segment; 0 gives polynomials.
-    times : sequence of float
-        Times of the waypoints [s].
+    durations : sequence of Fraction, of length nsegments
+        Exact durations of the segments [s]; of a closed plan as many as waypoints.
     ends : sequence of Ends, of length nsegments
         Orders that determine each segment, free entries included.
     free : sequence of (int, int)
@@ -51,14 +52,12 @@ def conjugate_digits(
         None where the equations are singular.
     """
     size = table.shape[1]
-    durations = np.diff(times)
     # Equations contain powers of the durations up to 2 size - 1, elimination the products of two of them; ends that
     # nearly coincide on the circle lead to divisions by powers of their distance.
-    spread = max(float(durations.max() / durations.min()), 10.0)
+    spread = max(float(max(durations) / min(durations)), 10.0)
     digits = 40 + math.ceil(2 * size * (2.0 * math.log10(spread) + math.log10(2.0 * math.pi / (2.0 * math.pi - alpha))))
     with decimal.localcontext(decimal.Context(digits, Emin=decimal.MIN_EMIN, Emax=decimal.MAX_EMAX)):
-        moments = [Decimal(t) for t in times]
-        steps = [b - a for a, b in itertools.pairwise(moments)]
+        steps = [Decimal(h.numerator) / Decimal(h.denominator) for h in durations]
         place = {entry: n for n, entry in enumerate(free)}
         weights = [_derivatives(alpha, pair, size, digits) for pair in ends]
         solution = _solved([_jump(entry, place, steps, weights, ends, table) for entry in free])
@@ -74,11 +73,11 @@ def _jump(
     table: Array,
 ) -> _Row:
     """Equation of a free entry: continuity of its conjugate derivative."""
-    i, k = entry
+    i, k = entry  # segment -1 is the last one of a closed plan
     order = 2 * table.shape[1] - 1 - k
     unknown, known = dict[int, Decimal](), [Decimal(0)] * table.shape[2]
     for segment, side in ((i - 1, 1), (i, 0)):
-        data = [(segment + end, given) for end in (0, 1) for given in ends[segment][end]]
+        data = [((segment + end) % len(table), given) for end in (0, 1) for given in ends[segment][end]]
         for (waypoint, given), weight in zip(data, weights[segment][side][order], strict=True):
             factor = weight * steps[segment] ** (given - order) * (1 - 2 * side)
             n = place.get((waypoint, given))

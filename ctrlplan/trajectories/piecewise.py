@@ -306,7 +306,10 @@ class PiecewiseSpline(WaypointSpline):
             plan = self._again(entries, self._warn, self)
         else:
             if derivatives is not None:
-                raise TypeError("derivatives must be given with an array of positions, got waypoints")
+                raise TypeError(
+                    "derivatives must be given with an array of positions, as np.array([...]), "
+                    f"got a {type(waypoints).__name__}"
+                )
             points = increasing(same_times(waypoints, self.waypoints))
             plan = self._again(Entries.of(points), self._warn, self)._with_fields(waypoints=points)
         plan._check_swing()

@@ -118,6 +118,7 @@ class _Group:
             own = _placed(rows.astype(values.dtype), places, values)
         if self.closed:
             own = np.concatenate([own, own[:, :, :1]], axis=2)
+            decimals = None if decimals is None else np.concatenate([decimals, decimals[:, :, :1]], axis=2)
         return own, decimals
 
 

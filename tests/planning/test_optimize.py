@@ -622,6 +622,14 @@ def test_chosen_times_are_never_worse(seed, options):
     np.testing.assert_array_equal(best[~np.isnan(table)], table[~np.isnan(table)])
 
 
+@pytest.mark.parametrize("free_times", [False, True])
+@pytest.mark.parametrize(("unit", "length"), [(1.0, 1e200), (1e-60, 1e150)])
+def test_a_cost_beyond_floating_point_is_an_error(unit, length, free_times):
+    points = [Waypoint(0, 0, 0, 0), Waypoint(unit, length), Waypoint(3 * unit, -length, 0, 0)]
+    with pytest.raises(ValueError, match=r"the cost must stay within floating point, got an .* other units"):
+        optimize_waypoints(points, free_times=free_times)
+
+
 def test_times_that_are_best_stay():
     resting = [Waypoint(0, 1), Waypoint(0.3, 1), Waypoint(1, 1)]
     found = optimize_waypoints(resting, free_times=True)

@@ -140,7 +140,7 @@ def exact_spline(times, values, size):
     return found
 
 
-@pytest.mark.parametrize("ratio", [1e-1, 1e-4, 1e-8])
+@pytest.mark.parametrize("ratio", [1e-1, 1 / 40, 1e-4, 1e-8])
 def test_segments_of_very_different_durations_keep_their_digits(ratio, monkeypatch):
     """Extended precision, which long plans use, against 60 digits."""
     monkeypatch.setattr("ctrlplan.trajectories.conjugate._DECIMALS", 0)
@@ -277,6 +277,92 @@ def test_a_cam_closes_with_all_free_derivatives(n, alpha):
     assert twice(plan.end + 0.4) == pytest.approx(plan(plan.start + 0.4), abs=1e-13)
 
 
+def exact_closed_spline(times, period, table):
+    """Power coefficients (nsegments, 2 size) by time since the start of each segment, in 60 digits, from one system.
+
+    Each segment meets the prescribed entries (n, size); free ones and their conjugates are continuous.
+    """
+    n, size = table.shape
+    with mpmath.workdps(60):
+        moments = [mpmath.mpf(float(t)) for t in times]
+        h = [b - a for a, b in itertools.pairwise([*moments, moments[0] + mpmath.mpf(period)])]
+        m = 2 * size
+        matrix, right = mpmath.zeros(n * m), mpmath.zeros(n * m, 1)
+
+        def add(row, k, end, order, sign):
+            """Derivative of segment k at an end, in its own unit of time."""
+            for j in range(order, m):
+                matrix[row, k * m + j] += sign * mpmath.ff(j, order) / h[k] ** order * (1 if end or j == order else 0)
+
+        row = 0
+        for i in range(n):
+            for order in range(size):
+                if np.isnan(table[i, order]):
+                    for joined in (order, m - 1 - order):
+                        add(row, i - 1 if i else n - 1, 1, joined, 1)
+                        add(row, i, 0, joined, -1)
+                        row += 1
+                else:
+                    for k, end in ((i - 1 if i else n - 1, 1), (i, 0)):
+                        add(row, k, end, order, 1)
+                        right[row] = mpmath.mpf(float(table[i, order]))
+                        row += 1
+        solved = mpmath.lu_solve(matrix, right)
+        return [[solved[k * m + j] / h[k] ** j for j in range(m)] for k in range(n)]
+
+
+@pytest.mark.parametrize("ratio", [1e-3, 1e-7])
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_a_closed_plan_with_very_different_durations_keeps_its_digits(ratio, unit):
+    times = unit * np.array([0.3, 1.3, 1.3 + ratio, 2.6])
+    table = np.full((4, 3), FREE)
+    table[:, 0] = [0.2, -1.0, 0.5, 1.5]
+    table[2, 2] = -0.7 / unit**2
+    table[3, 1] = 0.1 / unit
+    period = 4.0 * unit
+    points = [Waypoint.from_array(t, jet[:, None].copy(), None) for t, jet in zip(times, table, strict=True)]
+    plan = PiecewiseSpline.cyclic(points, period)
+    exact = exact_closed_spline(times, period, table)
+    got, wanted = [], []
+    for k, h in enumerate(np.diff(plan.breakpoints).tolist()):
+        for s in (0.0, 0.3 * h, 0.8 * h):
+            got.append(plan.segment_jet(k, np.array([s]), 2)[:, 0, 0])
+            with mpmath.workdps(60):
+                powers = [
+                    [mpmath.ff(j, nu) * c * mpmath.mpf(s) ** (j - nu) for j, c in enumerate(exact[k]) if j >= nu]
+                    for nu in range(3)
+                ]
+                wanted.append([float(mpmath.fsum(terms)) for terms in powers])
+    got, wanted = np.array(got), np.array(wanted)
+    assert (np.abs(got - wanted).max(axis=0) <= 1e-14 * np.abs(wanted).max(axis=0)).all()
+
+
+def test_new_values_with_other_free_entries_are_those_of_a_new_plan():
+    times, values = data(30, 2)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(30, 2), labels=["x", "z"])
+    other = np.random.default_rng(4).normal(size=values.shape)
+    mixed = at_rest(30, 2)
+    mixed[1] = np.stack([mixed[1], mixed[1]])
+    mixed[1][1, 7] = 0.5
+    t = np.linspace(times[0], times[-1], 333)
+    for given in (mixed, at_rest(30, 1), {1: 0.0, 2: 0.0}, at_rest(30, 2)):
+        got = plan.with_values(other, derivatives=given)
+        wanted = PiecewiseSpline.from_arrays(times, other, derivatives=given)
+        np.testing.assert_array_equal(got.jet(t, 3), wanted.jet(t, 3))
+        assert got.labels == ("x", "z")
+
+
+def test_waypoints_of_a_plan_cannot_change_it():
+    times, values = data(5, 2)
+    given = at_rest(5, 2)
+    given[1][2] = 0.25
+    points = PiecewiseSpline.from_arrays(times, values, derivatives=given).waypoints
+    assert [point.complete for point in points] == [True, False, False, False, True]
+    assert points[2] == Waypoint(times[2], values[:, 2], [0.25, 0.25], [FREE, FREE])
+    with pytest.raises(ValueError, match="read-only"):
+        points[0].jet[0, 0] = 1.0
+
+
 def test_a_closed_plan_is_saved_and_retimed(tmp_path):
     points = [Waypoint(0.0, 0.0, 0.0), Waypoint(1.0, 1.0), Waypoint(2.5, -1.0)]
     plan = PiecewiseSpline.cyclic(points, 4.0)
@@ -326,6 +412,8 @@ def test_new_values_of_another_shape_are_rejected():
         plan.with_values(np.zeros((2, 4)))
     with pytest.raises(TypeError, match="derivatives must be given with an array of positions"):
         plan.with_values(plan.waypoints, derivatives={1: 0.0})
+    with pytest.raises(TypeError, match=r"as np.array\(\[...\]\), got a list"):
+        plan.with_values([[0.0] * 3] * 2, derivatives={1: 0.0})
 
 
 def test_the_arrays_are_copied():
@@ -345,6 +433,8 @@ def test_a_period_shorter_than_the_waypoints_is_rejected(period):
 def test_a_closed_plan_with_undetermined_entries_is_rejected():
     with pytest.raises(ValueError, match="must be determined by the prescribed ones"):
         PiecewiseSpline.cyclic([Waypoint(0.0, np.nan, 1.0), Waypoint(1.0, np.nan, 1.0)], 2.0)
+    with pytest.raises(ValueError, match="got an axis without any prescribed position"):
+        PiecewiseSpline.from_arrays([0.0, 1.0, 2.0], [[0.0, 1.0, 2.0], [FREE] * 3], derivatives={1: 0.0})
     with pytest.raises(ValueError, match=r"alpha must be a number in \[0, 2 pi\) here"):
         PiecewiseSpline.cyclic([Waypoint(0.0, 0.0), Waypoint(1.0, 1.0)], 2.0, alpha="auto")
 
