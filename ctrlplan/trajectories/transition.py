@@ -135,7 +135,9 @@ class Transition(Displayed, Fields):
         if self._matrix is None:
             data = np.array(own).reshape(-1, naxes)[self._rows]
             scale = self._powers[self._system.order_index] / FACTORIALS[self._system.order_index]
-            return self._system.fitted(data, (0.0, self.horizon), self.horizon, data * scale[:, None]) * self._time_scale
+            return (
+                self._system.fitted(data, (0.0, self.horizon), self.horizon, data * scale[:, None]) * self._time_scale
+            )
         # Positions relative to the start, as in `NewtonSystem.coefficients`.
         first = (self.order + 1) * naxes
         for axis in range(naxes):
