@@ -7,12 +7,17 @@ import inspect
 import json
 import math
 import warnings
+from importlib import import_module
 
 import control as ct
 import numpy as np
 import pytest
 
 import ctrlplan as cp
+from ctrlplan.planning import plan_excess_length, plan_length
+from ctrlplan.reports import plot_trajectory
+from ctrlplan.simulation import equilibrium_at
+from ctrlplan.trajectories import Joined, Repeated, Stacked, Sum
 
 POINTS = [(0.4, 2.0), (0.7, 10.0), (1.2, 10.0), (1.5, 5.0), (1.8, 1.0)]
 PERIOD = cp.PiecewiseSpline.cyclic([cp.Waypoint(0, 0, 0, 0), *(cp.Waypoint(t, y) for t, y in POINTS)], 2.0)
@@ -22,6 +27,10 @@ TIMES = np.linspace(0.0, 9.0, 181)
 LAG = ct.tf([4.0], [1.0, 4.0], inputs="y", outputs="v", name="lag")
 LOOP = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
 MOTOR = cp.flat_system(cp.plants.dc_motor(), "angle")
+FITTED = cp.fit_feedforward(
+    cp.read_log({"time": TIMES, "u": 2.0 * PERIOD.repeat(5).jet(TIMES, 1)[1, 0], "y": PERIOD.repeat(5)(TIMES)}),
+    PERIOD.repeat(5),
+)
 NEEDS_END = "must have an end, got a plan that repeats for all future times"
 
 
@@ -84,6 +93,19 @@ def pointed(plan):
     return flat.states_and_inputs(both, TIMES)[0]
 
 
+def crane_driven(plan):
+    """A crane with a load of constant height."""
+    swing = cp.TrigSpline.cyclic([cp.Waypoint(0.0, 0.0), cp.Waypoint(4.0, 1.0)], 8.0).repeat(plan.count)
+    both = cp.stack([swing, cp.Step(10.0, 10.0)], labels=["x", "z"])
+    return cp.simulate(cp.plants.crane_loop(cp.plants.Crane(), both), TIMES).outputs[:2]
+
+
+def drawn_lines(plan):
+    """Values of the lines of a figure within the first period."""
+    lines = [line.get_data() for axes in plan.plot(2).figure.axes for line in axes.lines]
+    return np.concatenate([np.asarray(y)[np.asarray(x) < PERIOD.end] for x, y in lines])
+
+
 def windows(plan):
     return cp.reference_window(plan, 7.3, 0.1, 20)
 
@@ -119,6 +141,10 @@ SAME = {
     "states_and_inputs": pointed,
     "states_and_inputs, motor": lambda plan: MOTOR.states_and_inputs(plan, TIMES)[1],
     "then": lambda plan: MOVE.then(plan).jet(TIMES, 3),
+    "crane_loop": crane_driven,
+    "check_limits": lambda plan: MOTOR.check_limits(plan, {"voltage"}) is None,
+    "equilibrium_at": lambda plan: equilibrium_at(loop(plan), plan, 5.3, [0])[0],
+    "create_iosystem": lambda plan: cp.simulate(FITTED.create_iosystem(plan), TIMES).outputs,
     "+": lambda plan: (plan + MOVE - 0.5 * plan.shift(0.3)).jet(TIMES, 3),
     "select": lambda plan: cp.stack([plan, MOVE], labels=["a", "b"]).select("a").jet(TIMES, 3),
     "shaped": lambda plan: cp.Shaper.zv(10.0)(plan).jet(TIMES, 3),
@@ -131,6 +157,18 @@ SAME = {
     "bounds": lambda plan: plan.bounds(lambda jet: jet[0, 0], 0, 1.0).upper,
 }  # fmt: skip
 """What must give the same as many repetitions."""
+
+ONE_PERIOD = {
+    "plan_length": plan_length,
+    "plan_excess_length": plan_excess_length,
+    "PeakDerivative": cp.PeakDerivative(2),
+    "SquaredDerivative": cp.SquaredDerivative(3),
+    "plot": drawn_lines,
+    "plot_trajectory": lambda plan: [axes.get_xlim() for axes in plot_trajectory(plan).figure.axes],
+    "waypoints": lambda plan: [w.time for w in plan.waypoints],
+    "breakpoints": lambda plan: plan.breakpoints,
+}
+"""What is that of one period."""
 
 REJECTED = {
     "avoid": lambda plan: cp.avoid(cp.stack([plan, 0.5 * plan]), [cp.Disc((2.0, 0.0), 0.5)]),
@@ -150,24 +188,39 @@ REJECTED = {
     "retime": lambda plan: plan.retime(3.0),
     "repeat": lambda plan: plan.repeat(2),
     "final": lambda plan: plan.final,
+    "Repeated": lambda plan: Repeated(plan, 2),
+    "Joined": lambda plan: Joined((plan, MOVE)),
+    "Stacked": lambda plan: Stacked((plan, MOVE)),
+    "Sum": lambda plan: Sum((plan, MOVE)),
     "export .c": lambda plan: plan.export("move.c"),
 }
 
+FOLDERS = ("flatness", "planning", "reports", "simulation", "studies", "systems", "systems.plants", "trajectories")
+
 TAKES_NO_TRAJECTORY = {
     "AlphaChoice", "Avoidance", "BlockTraits", "Clearance", "Comparison", "Fastest", "Optimum",  # results
+    "Failure", "MeasuredRun", "MetricsTable", "Path", "Run", "Tracked",  # entries of results
     "PiecewiseSpline", "PolySpline", "TrigSpline", "choose_alpha", "explore", "optimize_waypoints",  # waypoints
+    "PlanSource",  # made by create_source_iosystem
 }  # fmt: skip
 
 
 def test_every_export_that_takes_a_plan_is_here():
-    names = {"plan", "plans", "reference", "trajectory", "law"}
+    names = {"plan", "plans", "reference", "trajectory", "law", "parts"}
+    folders = [import_module(f"ctrlplan.{name}") for name in FOLDERS]
     found = set()
-    for export in cp.__all__:
-        thing = getattr(cp, export)
+    for module, export in [(folder, name) for folder in (cp, *folders) for name in folder.__all__]:
+        thing = getattr(module, export)
         if callable(thing) and not (inspect.isclass(thing) and issubclass(thing, Exception)):
             found |= {export} if names & set(inspect.signature(thing).parameters) else set()
-    tested = {name.partition(",")[0] for name in (*SAME, *REJECTED)}
+    tested = {name.partition(",")[0] for name in (*SAME, *ONE_PERIOD, *REJECTED)}
     assert found - TAKES_NO_TRAJECTORY <= tested
+
+
+@pytest.mark.parametrize("name", ONE_PERIOD)
+def test_it_is_that_of_one_period(name):
+    # Times of a later period are rounded.
+    np.testing.assert_allclose(ONE_PERIOD[name](ENDLESS), ONE_PERIOD[name](PERIOD), rtol=1e-12, atol=1e-11)
 
 
 @pytest.mark.parametrize("name", SAME)
@@ -189,6 +242,18 @@ def test_it_is_as_many_repetitions(name):
 def test_an_end_is_required(name):
     with pytest.raises(ValueError, match=NEEDS_END):
         REJECTED[name](ENDLESS)
+
+
+def test_passes_are_for_finite_times():
+    with pytest.raises(ValueError, match="time must be finite, got inf"):
+        ENDLESS.covering(math.inf)
+
+
+def test_a_file_and_equality(tmp_path):
+    ENDLESS.save(tmp_path / "cam.json")
+    text = (tmp_path / "cam.json").read_text()
+    assert json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))["type"] == "Repeated"
+    assert cp.load_trajectory(tmp_path / "cam.json") == ENDLESS != LONG
 
 
 def test_steps_are_shorter_than_segments_whose_times_are_not_declared():

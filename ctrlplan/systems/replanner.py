@@ -310,6 +310,12 @@ class _Signals:
         return found
 
     @property
+    def goals(self) -> list[slice]:
+        """Inputs of each derivative of the goal."""
+        rows, each = self.goal_rows, 0 if self.goal is None else self.goal + 1
+        return [slice(rows.start + k, rows.stop, each) for k in range(each)]
+
+    @property
     def measurements(self) -> list[tuple[int, int]]:
         """Index of each measured input and of the planned one: all axes of one derivative after another."""
         if self.measured is None:
@@ -378,7 +384,7 @@ class _Correction(SampledBlock):
         self._passed, self._naxes, self._order = signals.passed, naxes, order
         self._seen, self._period = signals.measurements, horizons.period
         self._final = plan.final.tolist()
-        self._goal, self._fitted = slice(5, 5 + ngoals), fitted
+        self._goal, self._fitted, self._goals = slice(5, 5 + ngoals), fitted, signals.goals
         self._stop, self._stopped = stop, slice(fitted.stop, len(states))
         extrema = plan.extrema()
         self._range = float((extrema.maximum - extrema.minimum).max())
@@ -394,24 +400,24 @@ class _Correction(SampledBlock):
         after, values = x.copy(), u.tolist()
         finite = math.isfinite(sum(values))
         after[_NAN_INPUT] = 0.0 if finite else 1.0
-        stopped = self._is_stopped(x)
+        state = x.tolist()
+        stopped = self._is_stopped(state)
         if self._stop is not None and values[-1] > 0.5:
             if not stopped:
-                after[self._stopped] = self._stop.begun(t, self._reference(t, x, u, 2))
+                after[self._stopped] = self._stop.begun(t, self._reference(t, state, u, 2))
             return after
         if not finite:
             return after
-        goal = self._goal_of(values)
-        miss = self._miss(t, x, goal)
+        goal = [values[rows] for rows in self._goals]
+        miss = self._miss(t, state, goal) if goal else 0.0
         moved = miss > _ROUNDING
-        begins = self._deviation(t, x, u, values)
         if stopped:
-            miss = self._distance(t, x, goal)
+            miss = self._distance(t, state, goal)
         after[_UNREACHABLE] = 1.0 if miss > _MATTERS and self._horizons.too_short(t) else 0.0
-        found = self._horizons.at(t) if stopped or self._is_due(moved, t, x, begins) else None
+        found = self._horizons.at(t) if moved or stopped or self._is_due(t, state, values) else None
         if found is None:
             return after
-        coefficients = self._coefficients(found, begins, goal)
+        coefficients = self._coefficients(found, self._deviation(t, state, u, values), goal)
         if self._limits and not self._within_limits(t, found, coefficients, goal):
             after[_UNREACHABLE] = 1.0
             return after
@@ -424,12 +430,6 @@ class _Correction(SampledBlock):
             after[self._stopped] = 0.0
         return after
 
-    def _goal_of(self, values: list[float]) -> list[list[float]]:
-        """Derivatives of the goal, each by axis, among the inputs."""
-        rows = self._signals.goal_rows
-        each = (rows.stop - rows.start) // self._naxes
-        return [values[rows.start + k : rows.stop : each] for k in range(each)]
-
     def _coefficients(self, found: Transition, begins: list[float], goal: list[list[float]]) -> Array:
         """Coefficients of the correction from a jet, in one list, to the change of the goal."""
         if not goal and found is self._horizons.whole and self._horizons.home is not None:
@@ -441,65 +441,64 @@ class _Correction(SampledBlock):
         ]
         return found.coefficients_of_row([*begins, *ends, *[0.0] * (len(begins) - len(ends))])
 
-    def _is_stopped(self, x: Array) -> bool:
+    def _is_stopped(self, x: list[float]) -> bool:
         """Whether the reference stops or has stopped."""
-        return self._stop is not None and bool(x[self._stopped.start] > 0.5)
+        return self._stop is not None and x[self._stopped.start] > 0.5
 
-    def _distance(self, t: float, x: Array, goal: list[list[float]]) -> float:
+    def _distance(self, t: float, x: list[float], goal: list[list[float]]) -> float:
         """Distance of the stopped reference from the goal, relative to the move."""
         target = np.array(goal[0] if goal else self._final)
         position = self._stop_jets(t, x, 0)[0]
         return float(np.abs(target - position).max()) / max(self._range, float(np.abs(target).max())) or 0.0
 
-    def _stop_jets(self, t: float, x: Array, order: int) -> Array:
+    def _stop_jets(self, t: float, x: list[float], order: int) -> Array:
         """Jet (order + 1, naxes) of the stop."""
-        return np.array([] if self._stop is None else self._stop.jets(t, x[self._stopped].tolist(), order)).T
+        return np.array([] if self._stop is None else self._stop.jets(t, x[self._stopped], order)).T
 
-    def _reference(self, t: float, x: Array, u: Array, order: int) -> Array:
+    def _reference(self, t: float, x: list[float], u: Array, order: int) -> Array:
         """Jet (order + 1, naxes) of the reference while it is not stopped."""
         planned = u[: len(self._signals.inner)].reshape(self._naxes, -1)[:, : order + 1].T
-        return planned + np.array(self._corrections(t, x.tolist(), order)).T
+        return planned + np.array(self._corrections(t, x, order)).T
 
-    def _is_due(self, moved: bool, t: float, x: Array, begins: list[float]) -> bool:
-        if moved or self._trigger.kind == "goal":
-            return moved
+    def _is_due(self, t: float, x: list[float], values: list[float]) -> bool:
+        """Whether a fit is due though the goal has not moved."""
         if self._trigger.kind == "deviation":
-            off = [seen - own for seen, own in zip(begins, self._jets(t, x, 0), strict=False)]
+            own = self._jets(t, x, 0)
+            off = [values[i] - values[j] - value for (i, j), value in zip(self._seen, own, strict=False)]
             return math.hypot(*off) > self._trigger.threshold
         # From the reference to the same goal over the remaining time the fit would be the same plan.
-        return self._signals.measured is not None or not self._horizons.shrinking
+        return self._trigger.kind == "period" and (self._signals.measured is not None or not self._horizons.shrinking)
 
-    def _miss(self, t: float, x: Array, goal: list[list[float]]) -> float:
+    def _miss(self, t: float, x: list[float], goal: list[list[float]]) -> float:
         """Distance of the goal from its extrapolation by the last fit or the plan, relative to the move."""
-        if not goal:
-            return 0.0
         if x[_FITS] > 0.5:
-            last = x[self._goal].tolist()
-            rows = [last[k : k + self._naxes] for k in range(0, len(last), self._naxes)]
-            expected = _extrapolated(rows, t - float(x[_START]))
+            begin, end, each = self._goal.start, self._goal.stop, self._naxes
+            expected = _extrapolated([x[k : k + each] for k in range(begin, end, each)], t - x[_START])
         elif any(value for row in self._arrival[1 : len(goal)] for value in row):
             return math.inf  # after its end the plan has zero derivatives, which requires a fit
         else:
             expected = self._arrival
         size = max(self._range, *map(abs, goal[0]), *map(abs, expected[0]))
         far = max(
-            abs(a - b) * scale
-            for row, own, scale in zip(goal, expected, self._scales, strict=False)
-            for a, b in zip(row, own, strict=True)
+            [
+                abs(a - b) * scale
+                for row, own, scale in zip(goal, expected, self._scales, strict=False)
+                for a, b in zip(row, own, strict=True)
+            ]
         )
         return far / size if size else math.inf if far else 0.0
 
-    def _deviation(self, t: float, x: Array, u: Array, values: list[float]) -> list[float]:
+    def _deviation(self, t: float, x: list[float], u: Array, values: list[float]) -> list[float]:
         """Jet at the start of a fit minus that of the plan: all axes of one derivative after another."""
-        highest = self._signals.measured
-        if highest == self._order:
-            return [values[seen] - values[planned] for seen, planned in self._seen]
+        seen = [values[i] - values[j] for i, j in self._seen]
+        if self._signals.measured == self._order:
+            return seen
         if self._is_stopped(x):
             planned = u[: len(self._signals.inner)].reshape(self._naxes, -1)[:, : self._order + 1].T
             own = (self._stop_jets(t, x, self._order) - planned).ravel().tolist()
         else:
             own = self._jets(t, x, self._order)
-        return [*(values[seen] - values[planned] for seen, planned in self._seen), *own[len(self._seen) :]]
+        return seen + own[len(seen) :] if seen else own
 
     def _within_limits(self, t: float, found: Transition, coefficients: Array, goal: list[list[float]]) -> bool:
         """Whether the plan with a correction satisfies the limits until the end of both."""
@@ -562,13 +561,13 @@ class _Correction(SampledBlock):
             found = [value * (1.0 - stopped) + held * stopped for value, held in zip(found, jets, strict=True)]
         return np.array(found)
 
-    def _jets(self, t: float, x: Array, order: int) -> list[float]:
+    def _jets(self, t: float, x: list[float], order: int) -> list[float]:
         """Jet of the correction: all axes of one derivative after another."""
         step = self._horizons.step
         if step is not None and order == self._order and abs(t - x[_START] - self._period) <= 1e-15 * abs(t):
-            found: list[float] = step.dot(x[self._fitted].reshape(-1, self._naxes)).ravel().tolist()
+            found: list[float] = step.dot(np.array(x[self._fitted]).reshape(-1, self._naxes)).ravel().tolist()
             return found
-        return [value for row in zip(*self._corrections(t, x.tolist(), order), strict=True) for value in row]
+        return [value for row in zip(*self._corrections(t, x, order), strict=True) for value in row]
 
     def _corrections(self, t: Value, x: Value, order: int) -> list[list[Value]]:
         """Jets of the correction axis by axis, numeric or symbolic."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, NoReturn
-from weakref import WeakKeyDictionary
+from weakref import finalize
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -75,24 +75,43 @@ class Bounds:
     time_max: float
 
 
-_KNOWN: WeakKeyDictionary[Trajectory, dict[int, Extrema]] = WeakKeyDictionary()
-"""Extrema of derivatives by plan, which is immutable, and order."""
+@dataclass(frozen=True)
+class _Known:
+    """Results of searches for a plan, which is immutable.
+
+    Attributes
+    ----------
+    extrema : dict
+        Extrema of derivatives by order.
+    places : dict
+        Candidates for extrema by order and segment, relative to the duration of the
+        segment.
+    """
+
+    extrema: dict[int, Extrema] = field(default_factory=dict)
+    places: dict[tuple[int, int], Array] = field(default_factory=dict)
 
 
-_PLACES: WeakKeyDictionary[Trajectory, dict[tuple[int, int], Array]] = WeakKeyDictionary()
-"""Candidates for extrema by plan, order and segment, relative to the duration of the segment."""
+_KNOWN: dict[int, _Known] = {}
+"""Known results by the identity of a plan, as long as it exists."""
+
+
+def _known(plan: Trajectory) -> _Known:
+    """Known results of a plan."""
+    key = id(plan)
+    if key not in _KNOWN:
+        finalize(plan, _KNOWN.pop, key, None).atexit = False
+    return _KNOWN.setdefault(key, _Known())
 
 
 def keep_places(plan: Trajectory, moved: Trajectory) -> None:
     """Keep the places of extrema of a plan for the same path at other times, where values are computed again."""
-    places = _PLACES.get(plan)
-    if places is not None:
-        _PLACES[moved] = dict(places)
+    _known(moved).places.update(_known(plan).places)
 
 
 def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     """Extrema of the nu-th derivative, axis by axis; computed once for a plan, returned as the caller's own."""
-    known = _KNOWN.setdefault(plan, {})
+    known = _known(plan).extrema
     if nu not in known:
         known[nu] = _derivative_extrema(plan, nu)
     own = known[nu]
@@ -101,8 +120,8 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
 
 def carry_extrema(plan: Trajectory, moved: Trajectory, rate: float) -> None:
     """Keep the known extrema of a plan for the same plan at other times, whose rate is `rate`."""
-    known = _KNOWN.setdefault(moved, {})
-    for nu, own in _KNOWN.get(plan, {}).items():
+    known = _known(moved).extrema
+    for nu, own in _known(plan).extrema.items():
         with np.errstate(over="ignore", under="ignore"):
             low, high = own.minimum * rate**nu, own.maximum * rate**nu
         sizes = np.abs(np.concatenate([low, high]))
@@ -137,7 +156,7 @@ def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None
         return plan.segment_jet(segment, t, order)
 
     duration = float(plan.breakpoints[segment + 1] - plan.breakpoints[segment])
-    places = _PLACES.setdefault(plan, {})
+    places = _known(plan).places
     if (nu, segment) in places:
         t = _with_polished(jet, places[nu, segment] * duration, nu, duration)
     else:

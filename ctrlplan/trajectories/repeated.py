@@ -275,7 +275,7 @@ class Repeated(Trajectory):
         """
         if self.count is not None:
             return self
-        passes = max(1, math.floor((time - self.since) / self.period) + 2)
+        passes = max(1, math.floor((checked_finite(time, "time") - self.since) / self.period) + 2)
         return self.plan if passes == 1 else self._of(self.plan, passes, self.since)
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:

@@ -49,6 +49,10 @@ class Trajectory(Displayed, Fields, ABC):
     derivatives. At a breakpoint the value and derivatives are those of the
     following segment, at the end those of the last segment.
 
+    Trajectories are equal if their classes and their data (`to_dict`) are equal,
+    so that a loaded trajectory is equal to the saved one; they can be entries of a
+    set and keys of a dict.
+
     A new kind of trajectory must define
 
     - its fields, annotated at the top of the class, and a constructor that sets
@@ -130,6 +134,22 @@ class Trajectory(Displayed, Fields, ABC):
                 f"in {cls.__module__} after that in {former.__module__}; rename the class, or begin its name with _"
             )
         Trajectory.kinds[cls.__name__] = cls
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        if not isinstance(other, Trajectory):
+            return NotImplemented
+        # Plans that cannot be saved are equal to themselves only.
+        return (
+            type(self) is type(other)
+            and self.can_be_stored
+            and hash(self) == hash(other)
+            and bool(self.to_dict() == other.to_dict())
+        )
+
+    def __hash__(self) -> int:
+        return hash((type(self), self.labels, float(self.breakpoints[0]), float(self.breakpoints[-1])))
 
     @abstractmethod
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:

@@ -250,6 +250,8 @@ def test_json_restores_every_bit(plan, tmp_path):
     t = np.concatenate([times(plan), plan.breakpoints, np.linspace(plan.start, plan.end, 5000)])
     text = json.dumps(plan.to_dict(), allow_nan=False)
     for again in (trajectories.trajectory_from_dict(json.loads(text)), trajectories.load_trajectory(path)):
+        assert again == plan
+        assert len({again, plan, plan.shift(1.0)}) == 2
         assert type(again) is type(plan)
         assert again.labels == plan.labels
         assert again.to_dict() == plan.to_dict()
