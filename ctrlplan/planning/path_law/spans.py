@@ -14,6 +14,9 @@ from ctrlplan.trajectories.common import Array
 _STILL = 1e-9
 """Velocity below which a plan is at rest, relative to its peak."""
 
+_ROUNDING = 1e-14
+"""Duration of a segment, relative to the times of the plan, that is rounding."""
+
 _NEAR = 0.01
 """Distance from the end of a span at which its velocity is compared with that at twice the distance."""
 
@@ -170,7 +173,10 @@ def _spans(plan: Trajectory, stops: bool, edges: Sequence[float]) -> tuple[list[
     """Spans between breakpoints and waypoints, and the points between them."""
     segments, starts, ends = [], [], []
     inner = np.unique([*(waypoint.time for waypoint in plan.waypoints), *edges])
+    shortest = _ROUNDING * float(np.abs(plan.breakpoints[[0, -1]]).max())
     for segment, (left, right) in enumerate(pairwise(plan.breakpoints.tolist())):
+        if right - left <= shortest:  # between breakpoints of axes that are the same up to rounding
+            continue
         slack = 1e-9 * (right - left)
         own = inner[(inner > left + slack) & (inner < right - slack)] - left
         own = own[np.diff(own, prepend=0.0) > slack]
