@@ -402,7 +402,7 @@ def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, f
     if limited.order <= HIGHEST:
         _check_rest(plan, limited)
         _closed_form(plan, limited)  # raises for a sign that is infeasible at every duration
-        law = fast_law_of_signals(plan.shift(-start), limited)
+        law = fast_law_of_signals(plan.shift(-start), limited, start)
         found = None if law is None or span is not None else _at_its_limit(law.shift(start), limited)
         if found is not None:
             return found
@@ -423,7 +423,9 @@ def _with_given_speeds(plan: Trajectory, limited: Limited, span: tuple[float, fl
             f'"given" with those of order {limited.order}; limit lower derivatives, or use hold="waypoints"'
         )
     _check_rest(plan, limited)
-    found, margins = _with_reserves(plan, limited, span, partial(law_with_given_ends, plan.shift(-plan.start), limited))
+    found, margins = _with_reserves(
+        plan, limited, span, partial(law_with_given_ends, plan.shift(-plan.start), limited, plan.start)
+    )
     return Fastest(found, margins, ((found.duration, found.duration),), "path", limited, statement=_LOCAL)
 
 

@@ -66,7 +66,7 @@ def fastest_smooth_law(
         If no law with given rates at its ends is found.
     """
     edges = [time - start + plan.start for bound in bounds for time in changes(bound)]
-    parts = parts_of(plan, True, edges, given)
+    parts = parts_of(plan, True, edges, given, start)
     grid = Grid.of(plan, [part for part in parts if part.moves])
     problems = _Problems(grid, Activity.of(grid, bounds, SMOOTH_POINTS, start), reserve)
     x, duration = problems.start(), np.inf
@@ -170,7 +170,7 @@ def smooth_law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array
     b, slope, bend, third = (bernstein(_ENDS, degree, nu) @ table / lengths**nu for nu in range(4))
     rate = np.sqrt(b)
     ends = np.stack([np.zeros_like(rate), rate, 0.5 * slope, 0.5 * bend * rate, 0.5 * third * b + 0.25 * bend * slope])
-    ends[0, 1] = lengths
+    ends[0, 1] = np.diff(np.append(places, plan.end))  # without gaps between cells by rounding
     coefficients = _hermite(ends, durations)
     coefficients[-1] = places
     times = plan.start + np.append(0.0, np.cumsum(durations))

@@ -76,7 +76,7 @@ HIGHEST = 4
 """Highest derivative of the plan on which signals may depend: the law has four continuous ones."""
 
 
-def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory | None:
+def fast_law_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Trajectory | None:
     """Plan with a fast time law; limits may be slightly violated between points of the cells.
 
     Parameters
@@ -85,6 +85,8 @@ def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory | None
         Plan with a duration.
     limited : Limited
         The limits, of signals that depend on at most `HIGHEST` derivatives.
+    origin : float
+        Start [s] of the plan before it was moved to 0.
 
     Returns
     -------
@@ -92,7 +94,7 @@ def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory | None
         None if no multiple of the plan's rate satisfies the limits, or every one, or if
         no other rate makes it shorter.
     """
-    problems = _Problems(plan, limited, (None, None))
+    problems = _Problems(plan, limited, origin, (None, None))
     scale = problems.feasible_scale()
     if not 0.0 < scale < 1.0 / _SLOWEST:
         return None
@@ -100,24 +102,24 @@ def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory | None
     return Retimed(plan, law) if law.duration < (1.0 - _RESERVE) * plan.duration / scale**0.5 else None
 
 
-def law_with_given_ends(plan: Trajectory, limited: Limited, reserve: float) -> Trajectory:
+def law_with_given_ends(plan: Trajectory, limited: Limited, origin: float, reserve: float) -> Trajectory:
     """Plan with a fast time law and its own speeds at the ends; limits may be violated if none is found.
 
     Parameters
     ----------
-    plan, limited
+    plan, limited, origin
         As for `fast_law_of_signals`.
     reserve : float
         Distance from the limits at points of the cells, relative to their scale.
     """
-    return Retimed(plan, _Problems(plan, limited, (1.0, 1.0)).law(1.0, reserve, 0.0))
+    return Retimed(plan, _Problems(plan, limited, origin, (1.0, 1.0)).law(1.0, reserve, 0.0))
 
 
 class _Problems:
     """Linearised problems for the time law of a plan, with squared rates at its ends that may be given."""
 
-    def __init__(self, plan: Trajectory, limited: Limited, given: Rates) -> None:
-        self._parts = parts_of(plan, True, (), given)
+    def __init__(self, plan: Trajectory, limited: Limited, origin: float, given: Rates) -> None:
+        self._parts = parts_of(plan, True, (), given, origin)
         self._grid = Grid.of(plan, [part for part in self._parts if part.moves])
         self._spline = Spline.quartic(self._grid)
         self._signals, self._between = (_Signals(self._grid, limited, points) for points in (_POINTS, _CHECKS))
