@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Literal, NoReturn, get_args
 
 import numpy as np
@@ -21,7 +21,7 @@ from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
 from ctrlplan.planning.path_law import FastLaw, Rates, fastest_law, fastest_smooth_law
 from ctrlplan.planning.path_law.positions import required_rate
-from ctrlplan.planning.path_law.signals import HIGHEST, fast_law_of_signals
+from ctrlplan.planning.path_law.signals import HIGHEST, fast_law_of_signals, law_with_given_ends
 from ctrlplan.planning.path_law.vehicle import fastest_segment_law, orders_on_path
 from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, bottom, scan
@@ -385,17 +385,13 @@ def _fastest(
         return _searched(ReplannedPlans(plan, limited), span, hold, endless=False)
     if hold == "path":
         stops = isinstance(plan, PathPlan)  # at rest at its ends as well
-        if not stops and limited.derivatives_only and limited.order <= (3 if ends == "free" else 2):
+        if not stops and limited.derivatives_only and limited.order <= 3:
             return _fastest_on_path(plan, limited, span, ends)
-        if not stops and ends != "free":
-            raise ValueError(
-                f'ends must be "free" with limits of quantities or of derivatives of order 3 and higher, got {ends!r}'
-            )
         limited.check_constant('limits with hold="path"')
         limited.check_smooth(plan)
         if isinstance(plan, PathPlan):
             return _fastest_between_stops(plan, limited, span)
-        return _fastest_by_signals(plan, limited, span)
+        return (_with_given_speeds if ends == "given" else _fastest_by_signals)(plan, limited, span)
     return fastest_within(plan, limited, span)
 
 
@@ -406,7 +402,7 @@ def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, f
     if limited.order <= HIGHEST:
         _check_rest(plan, limited)
         _closed_form(plan, limited)  # raises for a sign that is infeasible at every duration
-        law = fast_law_of_signals(plan.shift(-start), limited)
+        law = fast_law_of_signals(plan.shift(-start), limited, start)
         found = None if law is None or span is not None else _at_its_limit(law.shift(start), limited)
         if found is not None:
             return found
@@ -417,6 +413,20 @@ def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, f
         law = with_fast_time_law(uniform.plan.shift(-start), limited)
     retimed = uniform if law is None else fastest_within(law.shift(start), limited, span)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold="path")
+
+
+def _with_given_speeds(plan: Trajectory, limited: Limited, span: tuple[float, float] | None) -> Fastest:
+    """Plan of short duration on its path with its speeds at the ends, under limits of any signals."""
+    if limited.order > HIGHEST:
+        raise ValueError(
+            f'ends must be "free" with limits that depend on derivatives of order {HIGHEST + 1} and higher, got '
+            f'"given" with those of order {limited.order}; limit lower derivatives, or use hold="waypoints"'
+        )
+    _check_rest(plan, limited)
+    found, margins = _with_reserves(
+        plan, limited, span, partial(law_with_given_ends, plan.shift(-plan.start), limited, plan.start)
+    )
+    return Fastest(found, margins, ((found.duration, found.duration),), "path", limited, statement=_LOCAL)
 
 
 def _check_not_vanishing(plan: Trajectory, found: Fastest) -> None:
@@ -558,25 +568,64 @@ def _with_free_ends(
 def _with_given_ends(
     plan: Trajectory, limited: Limited, span: tuple[float, float] | None
 ) -> tuple[Trajectory, Margins, tuple[float, ...]]:
-    """The same with the speeds of the plan at its ends, with which it cannot be retimed."""
+    """The same with the speeds of the plan at its ends."""
+    stops: list[tuple[float, ...]] = []
+
+    def law(reserve: float) -> Trajectory:
+        found = _law_on_path(plan, limited, (1.0, 1.0), reserve)
+        stops.append(found.stops)
+        return found.plan.shift(-plan.start)
+
+    return *_with_reserves(plan, limited, span, law), stops[-1]
+
+
+def _with_reserves(
+    plan: Trajectory,
+    limited: Limited,
+    span: tuple[float, float] | None,
+    law_with_reserve: Callable[[float], Trajectory],
+) -> tuple[Trajectory, Margins]:
+    """Plan with given speeds at its ends, with which it cannot be retimed, and its margins.
+
+    A plan with a distance from the limits, relative to them, is begun at time 0; the
+    smallest distance is taken with which the limits are satisfied.
+    """
     if span is not None:
         raise ValueError(
             f'durations must not be given with ends="given", got {span[0]:g} to {span[1]:g} s: at other durations the '
             "speeds at the ends are others"
         )
+    _check_given_speeds(plan, limited)
     for reserve in _RESERVES:
-        law = _law_on_path(plan, limited, (1.0, 1.0), reserve)
-        margins = limited.margins(law.plan)
+        found = law_with_reserve(reserve).shift(plan.start)
+        margins = limited.margins(found)
         if margins.active.fraction >= -_AT_ENDS:
-            return law.plan, margins, law.stops
-    raise ValueError(f"limits must be satisfied with the speeds at the ends, got {margins.active}")
+            return found, margins
+    raise ValueError(
+        f"limits must be satisfied with the speeds at the ends, got {margins.active}; raise this limit, lower the "
+        "speeds, or choose free ends"
+    )
+
+
+def _check_given_speeds(plan: Trajectory, limited: Limited) -> None:
+    """Raise for limits of speeds that those at the ends violate."""
+    for time in (plan.start, plan.end):
+        jet = limited.seen(plan).jet([time], limited.order, left=time > plan.start)
+        for bound, value in zip(limited.bounds, limited.values(jet)[:, 0].tolist(), strict=True):
+            low, high = (float(side[0]) for side in bound.sides(np.array([time])))
+            if bound.order <= 1 and max(low - value, value - high) > 1e-9 * bound.scale:
+                raise ValueError(
+                    f"limits must be satisfied with the speeds at the ends, got {bound.name} = {value:.6g} at {time:g} s "
+                    f"where it must be from {low:.6g} to {high:.6g}; raise this limit, lower the speed, or choose free "
+                    "ends"
+                )
 
 
 def _law_on_path(plan: Trajectory, limited: Limited, given: Rates = (None, None), reserve: float = 0.0) -> FastLaw:
     """Fast time law; positions in the path have full precision relative to its start."""
     begun = plan.shift(-plan.start) if plan.start else plan
     if limited.order == 3:
-        found = fastest_smooth_law(begun, limited.bounds, plan.start)
+        found = fastest_smooth_law(begun, limited.bounds, plan.start, given, reserve)
     else:
         found = fastest_law(begun, limited.bounds, plan.start, given, reserve)
     return replace(found, plan=found.plan.shift(plan.start)) if plan.start else found

@@ -39,7 +39,7 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
 
     The plan is at rest before its start and after its end: a plan that starts
     at nonzero velocity jumps there. Differences below 1e-9 of a derivative's peak, or of the
-    range of the position, are rounding.
+    range of the position, are rounding, as are those that the rounding of late times explains.
     """
     before = plan.jet(plan.breakpoints, order, left=True)
     after = plan.jet(plan.breakpoints, order)
@@ -53,7 +53,10 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     for k in np.flatnonzero((np.abs(size) > np.array(slack)[:, :, None]).any(axis=(1, 2))).tolist():
         exact = plan.extrema(k)
         slack[k] = _slack(k, exact.minimum, exact.maximum)
-    found = np.argwhere(np.abs(size) > np.array(slack)[:, :, None])
+    jumps = np.abs(size) > np.array(slack)[:, :, None]
+    if jumps.any():
+        jumps &= np.abs(size) > _by_rounding_of_times(plan, order)
+    found = np.argwhere(jumps)
     return tuple(
         Jump(int(k), float(plan.breakpoints[i]), plan.labels[a], float(size[k, a, i]))
         for k, a, i in sorted(found.tolist(), key=lambda entry: (entry[0], entry[2], entry[1]))
@@ -62,6 +65,12 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
 
 _INSIDE = np.array([0.1, 0.3, 0.45, 0.65, 0.85])
 """Parts of a segment at which a plan is sampled."""
+
+
+def _by_rounding_of_times(plan: Trajectory, order: int) -> Array:
+    """Differences (order + 1, naxes, nbreakpoints) between both sides if breakpoints are rounded."""
+    sides = [plan.jet(plan.breakpoints, order + 1, left=left)[1:] for left in (True, False)]
+    return 4.0 * np.spacing(np.abs(plan.breakpoints)) * np.abs(sides).max(axis=0)
 
 
 def _slack(order: int, minimum: Array, maximum: Array) -> Array:

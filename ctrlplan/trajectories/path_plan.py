@@ -255,12 +255,13 @@ class PathPlan(Joined):
         time: float,
         limits: Mapping[str, object],
         *,
-        synchronize: Literal["time", "path"] | None = "time",
+        synchronize: Literal["time", "path"] | None = "path",
     ) -> Trajectory:
         """Plan until a time, then to rest in minimum time; as `Trajectory.stop`.
 
-        With ``synchronize="path"`` a path plan, which ends on its path, at the end of the
-        present segment at the latest.
+        By default, ``synchronize="path"``, a path plan that ends on its path, at the
+        end of the present segment at the latest. "time" and None leave the path,
+        so that a vehicle with a heading cannot follow them.
         """
         moment = checked_finite(time, "time")
         if synchronize != "path" or not self.start <= moment <= self.end:

@@ -74,7 +74,7 @@ class Retimed(Trajectory):
         names = checked_labels(plan.labels if labels is None else labels, plan.naxes)
         slack = _ROUNDING * max(abs(plan.start), abs(plan.end))
         # Times of the law are rounded, by more than those of the plan if it starts late.
-        slack += 16.0 * float(np.spacing(max(abs(law.start), abs(law.end)))) * plan.duration / (law.duration or 1.0)
+        slack += 16.0 * float(np.spacing(max(abs(law.start), abs(law.end)))) * _end_rate(law)
         values = _checked_law(plan, law, slack)
         passed = np.array([_passing(law, values, float(b), slack) for b in plan.breakpoints[1:-1]])
         breakpoints = np.union1d(law.breakpoints, passed)
@@ -224,6 +224,14 @@ def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
     for segment in np.flatnonzero(np.diff(values) <= 0.0).tolist():
         raise ValueError(f"law must increase strictly, got {values[segment]:g} from {law.breakpoints[segment]:g} s on")
     return values
+
+
+def _end_rate(law: Trajectory) -> float:
+    """Maximum of the mean rate of a law and those at its ends."""
+    if not law.duration:
+        return 0.0
+    mean = float(np.abs(law.final - law.initial).max()) / law.duration
+    return max(mean, *(float(np.abs(law.jet([t], 1, left=t > law.start)[1]).max()) for t in (law.start, law.end)))
 
 
 def _passing(law: Trajectory, values: Array, target: float, slack: float) -> float:

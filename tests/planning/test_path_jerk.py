@@ -166,3 +166,65 @@ def test_the_plan_is_saved_with_its_law(tmp_path):
     found.save(tmp_path / "plan.json")
     t = np.linspace(found.start, found.end, 101)
     np.testing.assert_array_equal(cp.load_trajectory(tmp_path / "plan.json").jet(t, 3), found.jet(t, 3))
+
+
+def from_half_to_one(acceleration, jerk):
+    """Minimum time over 1 m from 0.5 m/s to 1 m/s with any accelerations at the ends.
+
+    At the limit of the acceleration up to v, to that of braking with constant jerk in the time r = 2 a/j, in which the
+    speed is v again, and on to 1 m/s: (v^2 - 1/4)/2a + v r + a r^2/2 - j r^3/6 + (v^2 - 1)/2a = 1.
+    """
+    r = 2 * acceleration / jerk
+    lost = 1 + 1.25 / (2 * acceleration) - acceleration * r**2 / 2 + jerk * r**3 / 6
+    v = 0.5 * acceleration * (-r + np.sqrt(r**2 + 4 * lost / acceleration))
+    return (v - 0.5) / acceleration + r + (v - 1) / acceleration
+
+
+FASTER = PolySpline([Waypoint(0, 0, 0.5, 0), Waypoint(1, 1, 1, 0)])
+
+
+@pytest.mark.parametrize("kind", ["derivatives", "quantities"])
+def test_given_speeds_at_the_ends(kind):
+    limits, system = limits_of(2, 1, 5), None
+    if kind == "quantities":
+        limits, system = {"y_d1": 2.0, "force": cp.Limits(-3.0, 3.0, rate=15.0)}, lambda jet: {"force": 3.0 * jet[2, 0]}
+    plan = FASTER.shift(2.0)
+    found = fastest(plan, limits, system, hold="path", ends="given")
+    best = from_half_to_one(1.0, 5.0)
+    assert best * (1 - 1e-9) <= found.duration <= 1.003 * best
+    assert found.plan.start == 2.0
+    assert [float(found.plan.jet(t, 1, left=t > 2.0)[1, 0]) for t in (2.0, found.plan.end)] == pytest.approx(
+        [0.5, 1.0], rel=1e-13
+    )
+    check_limits(found.plan, limits_of(2, 1, 5))
+    assert found.margins.satisfied
+    assert found.plan.jumps(2)[0].time == 2.0  # at its ends alone
+    assert {jump.time for jump in found.plan.jumps(2)} <= {2.0, found.plan.end}
+
+
+def test_a_given_speed_at_its_limit():
+    """With 1 m/s as the limit of the speed, at the end as well."""
+    found = fastest(FASTER, limits_of(1, 1, 100), hold="path", ends="given")
+    without = 0.5 + (1.0 - 0.375) / 1.0  # 0.5 s to 1 m/s over 0.375 m, and on
+    assert without <= found.duration <= 1.003 * without
+    assert found.plan.jet(found.plan.end, 1, left=True)[1, 0] == pytest.approx(1.0, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("limits", "system", "message"),
+    [
+        (limits_of(0.9, 1, 5), None, "limits must be satisfied with the speeds at the ends, got y_d1 = 1 at 1 s"),
+        (limits_of(2, 0.3, 5), None, "limits must be satisfied with the speeds at the ends of the plan and at corners"),
+        ({"v": 0.9}, lambda jet: {"v": jet[1, 0]}, "limits must be satisfied with the speeds at the ends, got v = 1"),
+    ],
+)
+def test_given_speeds_that_are_infeasible(limits, system, message):
+    with pytest.raises(ValueError, match=message):
+        fastest(FASTER, limits, system, hold="path", ends="given")
+
+
+@pytest.mark.slow
+def test_limits_of_the_jerk_far_above_use_cost_nothing():
+    plan = random_path(5, 3, 1)
+    without = fastest(plan, {"velocity": 2.0, "acceleration": 4.0}, hold="path").duration
+    assert fastest(plan, limits_of(2, 4, 1e6), hold="path").duration <= 1.001 * without

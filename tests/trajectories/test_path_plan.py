@@ -104,7 +104,8 @@ def test_a_stop_on_the_path_is_a_path(time):
     assert (np.abs(stopped(after, 2)) <= 3.0 * (1.0 + 1e-6)).all()
     again = cp.trajectory_from_dict(stopped.to_dict())
     np.testing.assert_array_equal(again(after), stopped(after))
-    assert not isinstance(PLAN.stop(3.0, limits), cp.PathPlan)
+    assert PLAN.stop(time, limits).to_dict() == stopped.to_dict()  # by default
+    assert not isinstance(PLAN.stop(3.0, limits, synchronize="time"), cp.PathPlan)
 
 
 def test_one_time_law_for_all_segments():

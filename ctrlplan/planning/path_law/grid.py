@@ -91,6 +91,11 @@ class Grid:
         bends[last] = [bend for part in self.parts for bend in part.bends]
         return ratios, bends
 
+    @property
+    def prescribed(self) -> Array:
+        """Prescribed squared rates of all open parts, at the start and at the end of each."""
+        return np.array([rate for part in self.parts for rate in part.rates if rate is not None], dtype=float)
+
     def ends(self, moving: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Cells that begin, and those that end, with a prescribed rate, in motion or at rest."""
         first = np.flatnonzero(np.diff(self.part, prepend=-1))
@@ -162,7 +167,7 @@ class Spline:
     def quartic(cls, grid: Grid) -> Spline:
         """Spline with three continuous derivatives in each part, by the coefficients of B-splines."""
         index, extraction = np.empty((5, grid.length.size), dtype=np.intp), np.empty((5, 5, grid.length.size))
-        size, bandwidth = 0, 4
+        size, bandwidth, fixed = 0, 4, []
         firsts = np.flatnonzero(np.diff(grid.part, prepend=-1)).tolist()
         for part, begin, end in zip(grid.parts, firsts, [*firsts[1:], grid.length.size], strict=True):
             cells, count, own = np.arange(end - begin), end - begin, slice(begin, end)
@@ -176,7 +181,9 @@ class Spline:
                 index[:, own], bandwidth = _interleaved(count)[(index[:, own] - 2) % count], 8
             index[:, own] += size
             size += count if part.closed else count + 4
-        return cls(index, extraction, size, bandwidth, np.zeros(size, dtype=bool))
+            prescribed = [rate is not None for rate in part.rates]
+            fixed += [False] * count if part.closed else [prescribed[0], *[False] * (count + 2), prescribed[1]]
+        return cls(index, extraction, size, bandwidth, np.array(fixed))
 
     @classmethod
     def of(cls, grid: Grid) -> Spline:

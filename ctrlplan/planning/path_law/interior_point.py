@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,9 @@ _FAR = 1e6
 
 _NEAREST = 0.02
 """Minimum of the slacks at the start, relative to the limits."""
+
+_MISSED = 1e-6
+"""Distance from inequalities, relative to the limits, that is no rounding."""
 
 _STEP = 0.98
 """Step relative to the longest one within the inequalities."""
@@ -91,7 +95,8 @@ def minimum(problem: Problem, start: Array) -> Array:
     ValueError
         If no coefficients that satisfy the inequalities are found.
     """
-    return _Search(problem, start).minimum()
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # without a solution multipliers may overflow
+        return _Search(problem, start).minimum()
 
 
 class _Search:
@@ -125,7 +130,12 @@ class _Search:
             residual = np.where(self._fixed, 0.0, x * (gradient - self._pulled(y)))
             if gap < tolerance and np.abs(residual).sum() < tolerance and missed.min() > -1e-9:
                 return self._scale * x
-            solve = self._solver(curvature, y / w)
+            try:
+                solve = self._solver(curvature, y / w)
+            except LinAlgError:
+                if self._fixed.any() and missed.min() < -_MISSED:  # with free ends slow laws are feasible
+                    self._raise_infeasible()
+                raise ValueError(UNBOUNDED) from None  # rates without bound
             dx = solve(-gradient - self._pulled(y * missed / w))
             dw = self._changes(dx) + missed
             dy = -y - y * dw / w
@@ -136,10 +146,19 @@ class _Search:
             dy = (target - y * dw) / w - y
             primal, dual = (min(1.0, _STEP * _longest(own, change, 2.0)) for own, change in ((w, dw), (y, dy)))
             x, w, y = x + primal * dx, w + primal * dw, y + dual * dy
-        if missed.min() > -1e-9:
-            return self._scale * x
+        if not missed.min() > -1e-9:
+            self._raise_infeasible()
+        return self._scale * x
+
+    def _raise_infeasible(self) -> NoReturn:
+        if self._fixed.any():
+            raise ValueError(
+                "limits must be satisfied with the speeds at the ends of the plan and at corners, got no time law that "
+                "does; lower these speeds, raise the limits, or choose free ends"
+            )
         raise ValueError(
-            "limits must be satisfied with the speeds at the ends of the plan, got none that are; lower these speeds"
+            "limits must be satisfied by some time law on the path, got none that does; raise the limits, or use "
+            'hold="shape"'
         )
 
     def _duration(self, x: Array) -> float:
@@ -196,10 +215,7 @@ class _Search:
             terms[np.stack([fixed[i] | fixed[j] for i, j in self._pairs])] = 0.0
         bands = _summed(self._place, terms, (self._bandwidth + 1) * self._size).reshape(self._bandwidth + 1, self._size)
         bands[0] += np.where(self._fixed, 1.0, own)
-        try:
-            factor = cholesky_banded(bands, lower=True, check_finite=False, overwrite_ab=True)
-        except LinAlgError:  # rates without bound
-            raise ValueError(UNBOUNDED) from None
+        factor = cholesky_banded(bands, lower=True, check_finite=False, overwrite_ab=True)
         free = ~self._fixed
         return lambda right: free * cho_solve_banded((factor, True), free * right, check_finite=False)
 

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid, Spline
-from ctrlplan.planning.path_law.interior_point import minimum
+from ctrlplan.planning.path_law.interior_point import Problem, minimum
 from ctrlplan.planning.path_law.law import FastLaw, changes, losses, problem_of
 from ctrlplan.planning.path_law.rows import SMOOTH_POINTS, Activity
-from ctrlplan.planning.path_law.spans import Part, parts_of
+from ctrlplan.planning.path_law.spans import Part, Rates, parts_of
 from ctrlplan.trajectories import PiecewisePolynomial, Retimed, Trajectory
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 
@@ -42,7 +42,9 @@ _NODES, _WEIGHTS = (readonly(0.5 * own) for own in np.polynomial.legendre.leggau
 _ENDS = readonly(np.array([0.0, 1.0]))
 
 
-def fastest_smooth_law(plan: Trajectory, bounds: Sequence[Bound], start: float) -> FastLaw:
+def fastest_smooth_law(
+    plan: Trajectory, bounds: Sequence[Bound], start: float, given: Rates = (None, None), reserve: float = 0.0
+) -> FastLaw:
     """Time law of minimum duration under limits up to the jerk.
 
     Parameters
@@ -53,21 +55,79 @@ def fastest_smooth_law(plan: Trajectory, bounds: Sequence[Bound], start: float) 
         Limits of derivatives of axes up to order 3.
     start : float
         Start [s] of the plan for which limits over time are given.
+    given : (float or None, float or None), optional
+        Squared rates of the law at its ends; None for free ones.
+    reserve : float, optional
+        Distance from the limits, relative to them.
+
+    Raises
+    ------
+    ValueError
+        If no law with given rates at its ends is found.
     """
-    parts = parts_of(plan, True, [time - start + plan.start for bound in bounds for time in changes(bound)])
+    edges = [time - start + plan.start for bound in bounds for time in changes(bound)]
+    parts = parts_of(plan, True, edges, given, start)
     grid = Grid.of(plan, [part for part in parts if part.moves])
-    spline, activity = Spline.quartic(grid), Activity.of(grid, bounds, SMOOTH_POINTS, start)
-    x, duration = np.full(spline.size, _START * _constant(grid, activity)), np.inf
+    problems = _Problems(grid, Activity.of(grid, bounds, SMOOTH_POINTS, start), reserve)
+    x, duration = problems.start(), np.inf
     for refinement in range(_REFINEMENTS + 1):
-        local, duration = _converged(grid, spline, activity, x, duration)
-        loss = losses(activity, local, grid.length)
+        local, duration = problems.converged(x, duration)
+        loss = losses(problems.activity, local, grid.length)
         if loss.sum() < _LOSS or refinement == _REFINEMENTS:
             break
         counts = np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int)
         local, grid = on_pieces(local, counts), grid.divided(counts)
-        spline, activity = Spline.quartic(grid), Activity.of(grid, bounds, SMOOTH_POINTS, start)
-        x = spline.near(local)
+        problems = _Problems(grid, Activity.of(grid, bounds, SMOOTH_POINTS, start), reserve)
+        x = problems.near(local)
     return FastLaw(Retimed(plan, smooth_law(plan, parts, grid, local)), ())
+
+
+class _Problems:
+    """Problems on a grid, each with the limits of the jerk about a law.
+
+    Attributes
+    ----------
+    grid, activity
+        Cells, and the limited signals at their points.
+    """
+
+    def __init__(self, grid: Grid, activity: Activity, reserve: float) -> None:
+        self.grid, self.activity = grid, activity
+        self._reserve, self._spline = reserve, Spline.quartic(grid)
+
+    def start(self) -> Array:
+        """Coefficients of the first law."""
+        x = np.full(self._spline.size, _START * _constant(self.grid, self.activity))
+        x[self._spline.fixed] = self.grid.prescribed
+        if not self._spline.fixed.any():
+            return x
+        without = replace(self.activity, jerks=self.activity.jerks[:0])
+        return minimum(self._about(without, x), x)
+
+    def near(self, local: Array) -> Array:
+        """Coefficients near given Bernstein coefficients."""
+        x = self._spline.near(local)
+        x[self._spline.fixed] = self.grid.prescribed
+        return x
+
+    def converged(self, x: Array, last: float) -> tuple[Array, float]:
+        """Bernstein coefficients (degree + 1, ncells) of a local minimum, and its duration.
+
+        The decreases of the duration vanish faster than their power 3/2.
+        """
+        for _ in range(_ROUNDS):
+            problem = self._about(self.activity, x)
+            x = minimum(problem, np.where(self._spline.fixed, x, INSIDE * x))
+            duration = problem.duration(x)
+            gain, last = 1.0 - duration / last, duration
+            if abs(gain) < _GAIN ** (2.0 / 3.0):
+                break
+        return self._spline.coefficients(x), last
+
+    def _about(self, activity: Activity, x: Array) -> Problem:
+        rows = activity.rows(self.grid.length, self._spline.coefficients(x))
+        ends = self.grid.ends(moving=True)
+        return problem_of(self.grid, self._spline, rows.with_reserve(SMOOTH_POINTS.size, self._reserve, *ends))
 
 
 def _constant(grid: Grid, activity: Activity) -> float:
@@ -78,21 +138,6 @@ def _constant(grid: Grid, activity: Activity) -> float:
     others = float(without.worst(ones, grid.length).max())  # of the accelerations, or root of `speeds`
     jerks = float(activity.worst(ones, grid.length).max())
     return 1.0 / max(speeds, others if others > speeds**0.5 else 0.0, (jerks if jerks > others else 0.0) ** (2.0 / 3.0))
-
-
-def _converged(grid: Grid, spline: Spline, activity: Activity, x: Array, last: float) -> tuple[Array, float]:
-    """Bernstein coefficients (degree + 1, ncells) of a local minimum, and its duration.
-
-    The decreases of the duration vanish faster than their power 3/2.
-    """
-    for _ in range(_ROUNDS):
-        problem = problem_of(grid, spline, activity.rows(grid.length, spline.coefficients(x)))
-        x = minimum(problem, INSIDE * x)
-        duration = problem.duration(x)
-        gain, last = 1.0 - duration / last, duration
-        if gain < _GAIN ** (2.0 / 3.0):
-            break
-    return spline.coefficients(x), last
 
 
 def on_pieces(local: Array, counts: NDArray[np.intp]) -> Array:
@@ -125,7 +170,7 @@ def smooth_law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array
     b, slope, bend, third = (bernstein(_ENDS, degree, nu) @ table / lengths**nu for nu in range(4))
     rate = np.sqrt(b)
     ends = np.stack([np.zeros_like(rate), rate, 0.5 * slope, 0.5 * bend * rate, 0.5 * third * b + 0.25 * bend * slope])
-    ends[0, 1] = lengths
+    ends[0, 1] = np.diff(np.append(places, plan.end))  # without gaps between cells by rounding
     coefficients = _hermite(ends, durations)
     coefficients[-1] = places
     times = plan.start + np.append(0.0, np.cumsum(durations))

@@ -74,7 +74,7 @@ def fastest_law(
         If the rate is not limited, or velocities at the ends are infeasible.
     """
     edges = [time - start + plan.start for bound in bounds for time in changes(bound)]
-    parts = parts_of(plan, any(bound.order == 2 for bound in bounds), edges, given)
+    parts = parts_of(plan, any(bound.order == 2 for bound in bounds), edges, given, start)
     grid = Grid.of(plan, [part for part in parts if part.moves])
     for refinement in range(_REFINEMENTS + 1):
         spline, activity = Spline.of(grid), Activity.of(grid, bounds, POINTS, start)

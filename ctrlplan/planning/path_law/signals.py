@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from ctrlplan.planning.path_law.bernstein import bernstein
@@ -21,7 +22,7 @@ from ctrlplan.planning.path_law.interior_point import minimum
 from ctrlplan.planning.path_law.jerk import smooth_law
 from ctrlplan.planning.path_law.law import problem_of
 from ctrlplan.planning.path_law.rows import Rows
-from ctrlplan.planning.path_law.spans import parts_of
+from ctrlplan.planning.path_law.spans import Rates, parts_of
 from ctrlplan.trajectories import Retimed, Trajectory
 from ctrlplan.trajectories.common import FACTORIALS, Array
 from ctrlplan.trajectories.retimed import composed
@@ -62,6 +63,9 @@ _CHECKS: Array = np.asarray((np.arange(24) + 0.5) / 24.0, dtype=float)
 _SLOWEST = 1e-12
 """Smallest multiple of a squared rate that is tried, and reciprocal of the largest one."""
 
+_PENALTY = 10.0
+"""Increase of a duration relative to the maximum violation, where a law cannot be slowed down."""
+
 _SCALE, _BEYOND = 1e-4, 10.0
 """Resolution of multiples of b, and the violation attributed to one that is infeasible for the plant."""
 
@@ -72,7 +76,7 @@ HIGHEST = 4
 """Highest derivative of the plan on which signals may depend: the law has four continuous ones."""
 
 
-def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory | None:
+def fast_law_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Trajectory | None:
     """Plan with a fast time law; limits may be slightly violated between points of the cells.
 
     Parameters
@@ -81,6 +85,8 @@ def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory | None
         Plan with a duration.
     limited : Limited
         The limits, of signals that depend on at most `HIGHEST` derivatives.
+    origin : float
+        Start [s] of the plan before it was moved to 0.
 
     Returns
     -------
@@ -88,48 +94,98 @@ def fast_law_of_signals(plan: Trajectory, limited: Limited) -> Trajectory | None
         None if no multiple of the plan's rate satisfies the limits, or every one, or if
         no other rate makes it shorter.
     """
-    parts = parts_of(plan, True)
-    grid = Grid.of(plan, [part for part in parts if part.moves])
-    spline = Spline.quartic(grid)
-    signals, between = _Signals(grid, limited, _POINTS), _Signals(grid, limited, _CHECKS)
-    x = np.full(spline.size, 1.0)
-    scale = signals.feasible_scale(spline.coefficients(x), 1.0 / _SLOWEST)
+    problems = _Problems(plan, limited, origin, (None, None))
+    scale = problems.feasible_scale()
     if not 0.0 < scale < 1.0 / _SLOWEST:
         return None
-    x = _START * scale * x
-    reserve = np.full(grid.length.size, _RESERVE)
-    for _ in range(_TIGHTENINGS + 1):
-        x = _converged(grid, spline, signals, x, reserve)
-        excess = between.excess(spline.coefficients(x))
-        if excess.max() < _BETWEEN:
-            break
-        reserve += 1.5 * np.maximum(excess, 0.0)
-    law = smooth_law(plan, parts, grid, spline.coefficients(x))
+    law = problems.law(_START * scale, _RESERVE, _BETWEEN)
     return Retimed(plan, law) if law.duration < (1.0 - _RESERVE) * plan.duration / scale**0.5 else None
 
 
-def _converged(grid: Grid, spline: Spline, signals: _Signals, x: Array, reserve: Array) -> Array:
-    """Coefficients near a local minimum, with a distance (ncells,) from the limits in each cell."""
-    best, duration, trust = x, np.inf, 2.0
-    for _ in range(_ROUNDS):
-        try:
-            problem = replace(problem_of(grid, spline, signals.rows(spline.coefficients(x), reserve)), trust=trust)
-            tried = minimum(problem, x)
-        except ValueError:  # the linearised limits cannot be satisfied near this solution
-            x, trust = best, trust**0.4
-            if trust < 1.001:
+def law_with_given_ends(plan: Trajectory, limited: Limited, origin: float, reserve: float) -> Trajectory:
+    """Plan with a fast time law and its own speeds at the ends; limits may be violated if none is found.
+
+    Parameters
+    ----------
+    plan, limited, origin
+        As for `fast_law_of_signals`.
+    reserve : float
+        Distance from the limits at points of the cells, relative to their scale.
+    """
+    return Retimed(plan, _Problems(plan, limited, origin, (1.0, 1.0)).law(1.0, reserve, 0.0))
+
+
+class _Problems:
+    """Linearised problems for the time law of a plan, with squared rates at its ends that may be given."""
+
+    def __init__(self, plan: Trajectory, limited: Limited, origin: float, given: Rates) -> None:
+        self._parts = parts_of(plan, True, (), given, origin)
+        self._grid = Grid.of(plan, [part for part in self._parts if part.moves])
+        self._spline = Spline.quartic(self._grid)
+        self._signals, self._between = (_Signals(self._grid, limited, points) for points in (_POINTS, _CHECKS))
+
+    def feasible_scale(self) -> float:
+        """Largest squared rate, the same along the plan, that satisfies the limits at the points."""
+        return self._signals.feasible_scale(np.ones((5, self._grid.length.size)), 1.0 / _SLOWEST)
+
+    def law(self, rate: float, reserve: float, between: float) -> Trajectory:
+        """Time law near a local minimum.
+
+        Parameters
+        ----------
+        rate : float
+            Squared rate of the start.
+        reserve : float
+            Distance from the limits at the points.
+        between : float
+            Violation between them below which limits are not tightened.
+        """
+        x = np.where(self._spline.fixed, 1.0, rate)
+        x[self._spline.fixed] = self._grid.prescribed
+        reserves = np.full(self._grid.length.size, reserve)
+        for _ in range(_TIGHTENINGS + 1):
+            x = self._converged(x, reserves)
+            excess = self._between.excess(self._spline.coefficients(x))
+            if excess.max() <= between:
                 break
-            continue
-        scale = signals.feasible_scale(spline.coefficients(tried))
-        promised = 1.0 - problem.duration(tried) / duration
-        gain = 1.0 - problem.duration(scale * tried) / duration
-        if gain > 0.0:
-            best, duration = scale * tried, problem.duration(scale * tried)
-        if (scale > 1.0 - _GAIN and abs(gain) < _GAIN and trust > _SETTLED) or trust < 1.001:
-            break
-        x = tried if scale > _NEAR and gain > -_WORSE else best
-        trust = min(2.0 * trust, 4.0) if gain > 0.75 * promised else trust if gain > 0.25 * promised else trust**0.5
-    return best
+            reserves += 1.5 * np.maximum(excess, 0.0)
+        return smooth_law(self._grid.plan, self._parts, self._grid, self._spline.coefficients(x))
+
+    def _converged(self, x: Array, reserves: Array) -> Array:
+        """Coefficients near a local minimum, with a distance (ncells,) from the limits in each cell."""
+        best, duration, trust = x, np.inf, 2.0
+        for _ in range(_ROUNDS):
+            try:
+                rows = self._signals.rows(self._spline.coefficients(x), reserves)
+                problem = replace(problem_of(self._grid, self._spline, rows), trust=trust)
+                tried = minimum(problem, x)
+            except ValueError:  # the linearised limits cannot be satisfied near this solution
+                x, trust = best, trust**0.4
+                if trust < 1.001:
+                    break
+                continue
+            scale, feasible = self._slowed(tried)
+            promised = 1.0 - problem.duration(tried) / duration
+            gain = 1.0 - problem.duration(tried) / scale**0.5 / duration
+            if gain > 0.0:
+                best, duration = feasible, problem.duration(tried) / scale**0.5
+            if (scale > 1.0 - _GAIN and abs(gain) < _GAIN and trust > _SETTLED) or trust < 1.001:
+                break
+            x = tried if scale > _NEAR and gain > -_WORSE else best
+            trust = min(2.0 * trust, 4.0) if gain > 0.75 * promised else trust if gain > 0.25 * promised else trust**0.5
+        return best
+
+    def _slowed(self, x: Array) -> tuple[float, Array]:
+        """Factor of a squared rate with which it satisfies the limits, and the product.
+
+        With given rates at the ends there is no such factor; that of the duration is a
+        penalty.
+        """
+        local = self._spline.coefficients(x)
+        if self._spline.fixed.any():
+            return (1.0 + _PENALTY * max(self._signals.beyond(local), 0.0)) ** -2.0, x
+        scale = self._signals.feasible_scale(local)
+        return scale, scale * x
 
 
 class _Signals:
@@ -148,8 +204,16 @@ class _Signals:
         # A limit that is attained at rest has no reserve there.
         slack = np.array([bound.slack + 2.0 * _RESERVE if bound.slack else 0.0 for bound in bounds])[:, None]
         low, high = (np.array([[getattr(bound, side)] for bound in bounds]) for side in ("low", "high"))
-        self._low = np.maximum(low / self._scales, -_FAR) - slack
-        self._high = np.minimum(high / self._scales, _FAR) + slack
+        speeds = np.array([bound.order <= 1 for bound in bounds])[:, None] & self._at_given_speeds()
+        self._low = np.where(speeds, -_FAR, np.maximum(low / self._scales, -_FAR) - slack)
+        self._high = np.where(speeds, _FAR, np.minimum(high / self._scales, _FAR) + slack)
+
+    def _at_given_speeds(self) -> NDArray[np.bool_]:
+        """Points (npoints,) at which the rate is given."""
+        found = np.zeros((self._grid.length.size, self._points.size), dtype=bool)
+        first, last = self._grid.ends(moving=True)
+        found[first, 0], found[last, -1] = self._points[0] == 0.0, self._points[-1] == 1.0
+        return found.ravel()
 
     def feasible_scale(self, local: Array, largest: float = 1.0) -> float:
         """Largest multiple of a squared rate that satisfies the limits at the points, to `_SCALE`; 0 for none."""
@@ -171,6 +235,10 @@ class _Signals:
         while beyond(scale) > 0.0:
             scale *= 1.0 - 2.0 * _SCALE
         return scale
+
+    def beyond(self, local: Array) -> float:
+        """Maximum violation at the points with half the reserve, in the scale of the limits."""
+        return self._beyond(self._derivatives(local))
 
     def excess(self, local: Array) -> Array:
         """Maximum violation in each cell (ncells,), in the scale of the limits."""

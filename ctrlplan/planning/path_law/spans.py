@@ -14,6 +14,9 @@ from ctrlplan.trajectories.common import Array
 _STILL = 1e-9
 """Velocity below which a plan is at rest, relative to its peak."""
 
+_ROUNDING = 64.0 * float(np.finfo(float).eps)
+"""Duration of a segment, relative to the times of the plan, that is rounding."""
+
 _NEAR = 0.01
 """Distance from the end of a span at which its velocity is compared with that at twice the distance."""
 
@@ -84,7 +87,13 @@ class Part:
         return self.spans[0].moves
 
 
-def parts_of(plan: Trajectory, stops: bool, edges: Sequence[float] = (), given: Rates = (None, None)) -> list[Part]:
+def parts_of(
+    plan: Trajectory,
+    stops: bool,
+    edges: Sequence[float] = (),
+    given: Rates = (None, None),
+    origin: float = 0.0,
+) -> list[Part]:
     """Parts of a plan, dwells included.
 
     Parameters
@@ -97,8 +106,10 @@ def parts_of(plan: Trajectory, stops: bool, edges: Sequence[float] = (), given: 
         Times [s] at which limits change.
     given : (float or None, float or None), optional
         Squared rates at both ends; None for free ones.
+    origin : float, optional
+        Start [s] of the plan before it was moved to 0, of which its times have the rounding.
     """
-    spans, joints = _spans(plan, stops, edges)
+    spans, joints = _spans(plan, stops, edges, origin)
     ends = [0, *(k + 1 for k, joint in enumerate(joints) if joint.stops), len(spans)]
     parts = []
     for first, last in pairwise(ends):
@@ -166,11 +177,14 @@ def _joint(before: Array, after: Array, still: Array, stops: bool = True) -> _Jo
     return _Joint(False, False, ratio, bend)
 
 
-def _spans(plan: Trajectory, stops: bool, edges: Sequence[float]) -> tuple[list[Span], list[_Joint]]:
+def _spans(plan: Trajectory, stops: bool, edges: Sequence[float], origin: float) -> tuple[list[Span], list[_Joint]]:
     """Spans between breakpoints and waypoints, and the points between them."""
     segments, starts, ends = [], [], []
     inner = np.unique([*(waypoint.time for waypoint in plan.waypoints), *edges])
+    shortest = _ROUNDING * max(abs(plan.start), abs(plan.end), abs(origin))
     for segment, (left, right) in enumerate(pairwise(plan.breakpoints.tolist())):
+        if right - left <= shortest:  # between breakpoints of axes that are the same up to rounding
+            continue
         slack = 1e-9 * (right - left)
         own = inner[(inner > left + slack) & (inner < right - slack)] - left
         own = own[np.diff(own, prepend=0.0) > slack]

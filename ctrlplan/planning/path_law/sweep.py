@@ -63,7 +63,10 @@ class _Cells:
     def open(self, begin: int, end: int, rates: Rates) -> Array:
         """Rates at the starts of the cells of an open part, and at its end, some of which may be prescribed."""
         limit = np.empty(end - begin + 1)
-        limit[-1] = self._largest_end(end - 1) if rates[1] is None else rates[1]
+        limit[-1] = self._largest_end(end - 1)
+        if rates[1] is not None:
+            _check_speed("end", rates[1], limit[-1])
+            limit[-1] = rates[1]
         self._backward(limit, begin)
         if rates[0] is not None:
             _check_speed("start", rates[0], limit[0])
