@@ -11,8 +11,8 @@ exact      linear loops with any nesting; plans,       one matrix exponential fo
            constants or samples as inputs              of an input; the error is rounding
            with linear discrete blocks, and delays     the recursion from sample time to sample time,
            of what they hold or read                   plans exact in between; the error is rounding
-           with delays between continuous blocks       the method of steps with collocation, where the
-           that have a common divisor                  divisor is long enough; the error is rounding
+           with delays between continuous blocks       the method of steps with collocation, up to
+                                                       20,000 sums of delays; the error is rounding
 compiled   nonlinear loops whose blocks can be traced  blocks traced with CasADi symbols, compared
            (``pip install "ctrlplan[fast]"``)          with Python, and integrated by CVODES with
                                                        the exact Jacobian

@@ -18,12 +18,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
+from itertools import pairwise
 from math import floor
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
+from ctrlplan.simulation.collocation import Collocation
 from ctrlplan.simulation.exact import state_scale
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, closed, linear_forms, singular_loop
 from ctrlplan.simulation.network import Block, Network
@@ -295,6 +297,31 @@ class DelayedForm:
     a: Array
     b: Array
     lates: tuple[Late, ...]
+
+    @cached_property
+    def delayed(self) -> NDArray[np.intp]:
+        """Places of the outputs of delays among w."""
+        return np.concatenate([np.arange(late.columns.start, late.columns.stop) for late in self.lates])
+
+    @cached_property
+    def given(self) -> NDArray[np.intp]:
+        """Places of the other functions of time among w."""
+        return np.setdiff1d(np.arange(self.b.shape[1]), self.delayed)
+
+    @cached_property
+    def rows(self) -> list[slice]:
+        """Places of each delay among the outputs of delays."""
+        ends = np.cumsum([0, *(late.initial.size for late in self.lates)]).tolist()
+        return [slice(begin, end) for begin, end in pairwise(ends)]
+
+    @cached_property
+    def collocation(self) -> Collocation:
+        """Maps of parts of a run."""
+        columns = np.concatenate([self.delayed, self.given])
+        from_z, from_w = (
+            np.concatenate(rows) for rows in zip(*((x.from_z, x.from_w) for x in self.lates), strict=True)
+        )
+        return Collocation(self.a, self.b[:, columns], from_z, from_w[:, columns])
 
     @cached_property
     def norm(self) -> float:

@@ -56,8 +56,8 @@ def simulate(
     A continuous linear system, interconnections and plan sources included, is
     solved exactly: the error is rounding, whatever the sample spacing. So is a
     linear loop with discrete controllers (`sample_hold`) of one or more rates, and
-    with delays of what they hold or measure, and a linear loop with other delays
-    if these have a common divisor, also with the periods of discrete blocks.
+    with delays of what they hold or measure, and a linear loop with other delays,
+    unless more than 20,000 sums of delays matter that have no common divisor.
     Other systems are flattened, with one call of each block per step, and
     integrated from breakpoint to breakpoint: compiled by CasADi and solved by
     CVODES where every block can be traced, otherwise by Python and LSODA.

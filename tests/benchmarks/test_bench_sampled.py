@@ -188,3 +188,37 @@ def test_several_rates_and_delays(second, offsets, delay, benchmark, capsys):
     assert error <= 1e-11
     what = f"1 and {1e3 * second:g} ms, offsets {offsets}, delay {1e3 * delay:g} ms"
     show(capsys, benchmark, what, seconds, ratio, error)
+
+
+@pytest.mark.benchmark
+def test_comparison_of_four_plans(benchmark, capsys):
+    """Runs and metrics of four plans over 4.5 s, next to four recursions. Goal: at most 10."""
+    loop = cp.prepare(ct.interconnect([plant(), law()], inputs="r", outputs=["y", "u"]))
+    points = [cp.Waypoint(1.5 * k, float(k % 2), 0, 0) for k in range(3)]
+    plans = {
+        "step": cp.Step(1.0, labels=["r"]),
+        "polynomial": cp.PolySpline(points, labels=["r"]),
+        "trigonometric": cp.TrigSpline(points, alpha=1.0, labels=["r"]),
+        "piecewise": cp.PiecewiseSpline(points, alpha=2.0, labels=["r"]),
+    }
+    times = T[:4501]
+    m, k = at_one_rate()
+
+    def ours():
+        return cp.compare(loop, plans, times)
+
+    def by_hand():
+        found = {}
+        for name, plan in plans.items():
+            r, z, out = plan(times)[:, None], np.zeros(6), np.empty((times.size, 6))
+            for j in range(times.size):
+                out[j] = z
+                z = m @ z + k @ r[j]
+            found[name] = out[:, 0]
+        return found
+
+    benchmark.pedantic(ours, rounds=3, warmup_rounds=1)
+    seconds, ratio, (found, expected) = interleaved(ours, by_hand)
+    error = max(np.abs(found.responses[name].outputs[0] - expected[name]).max() for name in plans)
+    assert error <= 1e-12
+    show(capsys, benchmark, "compare, four plans", seconds, ratio, error)

@@ -1,6 +1,9 @@
-"""Exact responses of linear continuous loops with delays, compared with power series of each cell in 50 digits."""
+"""Exact responses of linear continuous loops with delays, compared with power series between marks in 32 digits."""
 
 import math
+from decimal import Decimal, localcontext
+from itertools import accumulate, pairwise
+from operator import mul
 
 import control as ct
 import mpmath as mp
@@ -10,76 +13,139 @@ import pytest
 import ctrlplan as cp
 
 A = [[-0.4, 1.0], [-3.0, -0.6]]
-TERMS = 50
+TERMS, NEAR, SAME = 30, Decimal("1e-20"), Decimal("1e-12")
 
 
-B = np.array([[1.0, 0.0, 0.2], [0.5, 1.0, 0.0]])
+B = np.array([[1.0, 0.0, 0.2, -0.1], [0.5, 1.0, 0.0, 0.3]])
 """Inputs r, and x some times ago."""
 
 
 def plant(inputs):
-    return ct.ss(A, B[:, : len(inputs)], np.eye(2), 0, inputs=inputs, outputs=["x", "v"], name="plant")
+    columns = [*B[:, : len(inputs) - ("h" in inputs)].T, *([[0.0, 1.0]] if "h" in inputs else [])]
+    return ct.ss(A, np.transpose(columns), np.eye(2), 0, inputs=inputs, outputs=["x", "v"], name="plant")
 
 
-def by_series(cell, end, delays, rows, plan, state, times):
-    """States of x' = A x + sum of rows[i] x(t - delays[i]) + b r, zero before the start.
+def by_powers(end, delays, rows, plan, state, times, law=None):
+    """States of x' = A x + sum of rows[i] x[0](t - delays[i]) + b r + (0, h), zero before the start, in 32 digits.
 
-    Powers of the time since the start of each cell; the delays and the breakpoints of the plan are multiples of a cell.
-    `plan`: (first, last), a rest-to-rest polynomial of fifth degree from 0 to 1 between these cells.
+    Powers of the time since each mark: all sums of 0, the ends of the plan and the sample times with multiples of the
+    delays. `plan`: (first, last), a rest-to-rest polynomial of fifth degree from 0 to 1 between these times. `law`:
+    (period, offset, gain), h = r - gain x[0] from each sample on. Also returns h at the times.
     """
-    with mp.workdps(50):
-        a, cell = mp.matrix(A), mp.mpf(cell)
-        matrices = [mp.matrix(row) for row in rows]
-        b, first, last = mp.matrix([1, 0.5]), *plan
-        length = (last - first) * cell
-        cells, x = [], mp.matrix(state)
-        for k in range(end):
-            r = [mp.mpf(1 if k >= last else 0)] + [mp.mpf(0)] * TERMS
-            if first <= k < last:
-                s = (k - first) * cell
-                whole = {3: 10 / length**3, 4: -15 / length**4, 5: 6 / length**5}
-                r = [
-                    sum((mp.binomial(i, j) * c * s ** (i - j) for i, c in whole.items() if i >= j), mp.mpf(0))
-                    for j in range(TERMS + 1)
-                ]
-            coefficients = [x]
-            for j in range(TERMS):
-                rate = a * coefficients[j] + b * r[j]
-                for matrix, delay in zip(matrices, delays, strict=True):
-                    if k >= delay:
-                        rate += matrix * cells[k - delay][j]
-                coefficients.append(rate / (j + 1))
-            cells.append(coefficients)
-            x = sum((c * cell**j for j, c in enumerate(coefficients)), mp.zeros(2, 1))
-        found = []
-        for t in times:
-            k = min(int(mp.floor(mp.mpf(float(t)) / cell + mp.mpf("1e-12"))), end - 1)
-            s = mp.mpf(float(t)) - k * cell
-            found.append([float(y) for y in sum((c * s**j for j, c in enumerate(cells[k])), mp.zeros(2, 1))])
+    with localcontext(prec=32):
+        a, b = [[*map(Decimal, row)] for row in A], [Decimal(1), Decimal("0.5")]
+        rows, delays = [[*map(Decimal, row)] for row in rows], [*map(Decimal, delays)]
+        end, (first, last), x = Decimal(end), map(Decimal, plan), [*map(Decimal, state)]
+        period, offset, gain = map(Decimal, law or (1, end, 0))
+        samples = [offset + k * period for k in range(int(end / period) + 1)]
+        sums = [Decimal(0)]
+        for delay in delays:
+            sums = [t + k * delay for t in sums for k in range(int((end - t) / delay) + 1)]
+        marks = sorted(t + s for t in {Decimal(0), first, last, *samples} for s in sums if t + s < end)
+        marks = [t for k, t in enumerate(marks) if not k or t - marks[k - 1] > NEAR] + [end]
+        binomial = [[Decimal(math.comb(i, j)) for j in range(i + 1)] for i in range(TERMS)]
+
+        def reference(t):
+            """Coefficients of r about a time."""
+            length, s = last - first, (t - first) / (last - first)
+            powers = _powers(s)
+            if not -NEAR <= s < 1 - NEAR:
+                return [Decimal(s > 0.5)] + [Decimal(0)] * TERMS
+            own = [
+                sum(binomial[i][j] * c * powers[i - j] for i, c in ((3, 10), (4, -15), (5, 6)) if i >= j)
+                for j in range(6)
+            ]
+            return [c / length**j for j, c in enumerate(own)] + [Decimal(0)] * TERMS
+
+        def past(t):
+            """Coefficients of x[0] about an earlier time, from those of the cell that contains it."""
+            if t < -NEAR:
+                return [Decimal(0)] * TERMS
+            k = max(k for k in range(len(cells)) if marks[k] <= t + NEAR)
+            known, s = cells[k][0], _powers(t - marks[k])
+            if s[1] <= NEAR:
+                return known
+            return [sum(binomial[i][j] * known[i] * s[i - j] for i in range(j, TERMS)) for j in range(TERMS)]
+
+        cells, h, found = [], Decimal(0), []
+        for left, right in pairwise(marks):
+            r, back = reference(left), [past(left - delay) for delay in delays]
+            if any(abs(t - left) < NEAR for t in samples):
+                h = r[0] - gain * x[0]
+            own = [[x[0]], [x[1]]]
+            for j in range(TERMS - 1):
+                held = (0, h if j == 0 else 0)
+                for i in (0, 1):
+                    fed = sum(row[i] * known[j] for row, known in zip(rows, back, strict=True))
+                    own[i].append((a[i][0] * own[0][j] + a[i][1] * own[1][j] + b[i] * r[j] + fed + held[i]) / (j + 1))
+            cells.append(own)
+            inside = [
+                Decimal(t) for t in times.tolist() if left - SAME <= Decimal(t) < right - SAME or t == right == end
+            ]
+            found += [[float(_sum(row, t - left)) for row in own] + [float(h)] for t in inside]
+            x = [_sum(row, right - left) for row in own]
     return np.array(found).T
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("delays", [(0.4,), (0.4, 0.6), (0.05, 0.6)])
+def _powers(s):
+    return [*accumulate([Decimal(1)] + [s] * (TERMS - 1), mul)]
+
+
+def _sum(coefficients, s):
+    return sum(c * power for c, power in zip(coefficients, _powers(s), strict=True))
+
+
+ROOT = math.sqrt(0.5)
+"""0.7071 s has no common divisor with tenths of a second."""
+
+
+@pytest.mark.parametrize("delays", [(0.4,), (0.4, 0.6), (0.05, 0.6), (0.4, ROOT), (0.3, 0.4, ROOT)])
 def test_delays_between_continuous_blocks(delays):
     """The plan begins and ends inside of cells, and comes back after every sum of the delays."""
+    loop = delayed_loop(delays)
+    plan = cp.PolySpline([cp.Waypoint(0.15, 0, 0, 0), cp.Waypoint(1.25, 1, 0, 0)], labels=["r"])
+    times = np.unique(np.append(np.random.default_rng(0).uniform(0.0, 3.0, 60), [0.0, 0.4, 0.6, 1.0, 3.0]))
+    expected = by_powers(3.0, decimals(delays), delayed_rows(delays), ("0.15", "1.25"), [0.3, -0.1], times)[:2]
+    found = cp.simulate(loop, times, plan, [0.3, -0.1])
+    assert (found.method, found.reason) == ("exact", "linear, with delays")
+    assert np.abs(found.outputs[:2] - expected).max() <= 2e-14 * np.abs(expected).max()
+    past = cp.simulate(loop, np.unique(np.maximum(times - delays[0], 0.0)), plan, [0.3, -0.1])
+    shown = np.where(times - delays[0] >= -1e-12, np.interp(times - delays[0], past.time, past.outputs[0]), 0.0)
+    assert np.abs(found.outputs[2] - shown).max() <= 2e-14 * np.abs(expected).max()
+
+
+def delayed_rows(delays):
+    return B[:, 1 : len(delays) + 1].T.tolist()
+
+
+def decimals(delays):
+    """The delays as decimals where they have few digits."""
+    return [f"{d:.2f}" if abs(round(d, 2) - d) < 1e-15 else d for d in delays]
+
+
+def delayed_loop(delays, *further, inputs=("r",), outputs=("x", "v", "w0")):
     names = [f"w{k}" for k in range(len(delays))]
     late = [
         cp.create_delay_iosystem(d, inputs="x", outputs=name, name=f"delay{k}")
         for k, (d, name) in enumerate(zip(delays, names, strict=True))
     ]
-    loop = ct.interconnect([plant(["r", *names]), *late], inputs=["r"], outputs=["x", "v", "w0"])
+    blocks = [plant(["r", *names, *(["h"] if further else [])]), *late, *further]
+    return ct.interconnect(blocks, inputs=list(inputs), outputs=list(outputs))
+
+
+@pytest.mark.parametrize("delays", [(0.15,), (ROOT,), (0.4, ROOT)])
+def test_samples_and_delays_without_a_common_divisor(delays):
+    """A law every 0.25 s from 0.03 s on; what it holds jumps, and returns after each delay."""
+    law = ct.ss([], [], [], [[1.0, -0.5]], 0.25, inputs=["r", "x"], outputs="h", name="law")
+    loop = delayed_loop(delays, cp.sample_hold(law, 0.25, 0.03), outputs=["x", "v", "h"])
     plan = cp.PolySpline([cp.Waypoint(0.15, 0, 0, 0), cp.Waypoint(1.25, 1, 0, 0)], labels=["r"])
-    times = np.unique(np.append(np.random.default_rng(0).uniform(0.0, 3.0, 60), [0.0, 0.4, 0.6, 1.0, 3.0]))
-    rows = [[[B[0, k + 1], 0.0], [B[1, k + 1], 0.0]] for k in range(len(delays))]
-    cells = [round(delay / 0.05) for delay in delays]
-    expected = by_series("0.05", 60, cells, rows, (3, 25), [0.3, -0.1], times)
-    found = cp.simulate(loop, times, plan, [0.3, -0.1])
-    assert (found.method, found.reason) == ("exact", "linear, with delays")
-    assert np.abs(found.outputs[:2] - expected).max() <= 2e-14 * np.abs(expected).max()
-    past = by_series("0.05", 60, cells, rows, (3, 25), [0.3, -0.1], np.maximum(times - delays[0], 0.0))[0]
-    shown = np.where(times - delays[0] >= -1e-12, past, 0.0)
-    assert np.abs(found.outputs[2] - shown).max() <= 2e-14 * np.abs(expected).max()
+    times = np.unique(np.append(np.random.default_rng(0).uniform(0.0, 2.0, 40), [0.0, 0.03, 0.28, 2.0]))
+    values = by_powers(
+        2.0, decimals(delays), delayed_rows(delays), ("0.15", "1.25"), [0.3, -0.1], times, ("0.25", "0.03", 0.5)
+    )
+    found = cp.simulate(loop, times, plan, [0.3, -0.1, 0.0])
+    assert found.method == "exact"
+    assert np.abs(found.outputs - values).max() <= 2e-14 * np.abs(values).max()
 
 
 def test_a_long_undamped_run():
@@ -116,18 +182,102 @@ def test_a_delayed_loop_that_overflows():
         cp.simulate(loop, [0.0, 30.0], None, 1.0, method="exact")
 
 
-def test_delays_without_a_common_part_run_by_another_method():
-    """x' = -x(t - 1) - x(t - pi) has no common part: the numerical methods run it, and the exact one says why not."""
+def two_delays(first, second, factors, moved):
     blocks = [
-        cp.create_delay_iosystem(delay, inputs="x", outputs=f"w{k}", initial=1.0, name=f"delay{k}")
-        for k, delay in enumerate((1.0, math.pi))
+        cp.create_delay_iosystem(delay, inputs="x", outputs=f"w{k}", name=f"delay{k}")
+        for k, delay in enumerate((first, second))
     ]
-    moved = ct.ss(0.0, [[-1.0, -1.0]], 1.0, 0.0, inputs=["w0", "w1"], outputs="x", name="moved")
-    loop = ct.interconnect([*blocks, moved], inputs=0, outputs="x")
-    found = cp.simulate(loop, [0.0, 0.5, 1.0], None, 1.0)
-    assert found.method in ("compiled", "python")
-    assert "delays of 1, 3.14159 s, sample times and breakpoints of functions of time" in found.reason
-    assert np.abs(found.outputs - [1.0, 0.0, -1.0]).max() <= 1e-7
+    return ct.interconnect([*blocks, moved(factors)], inputs="r", outputs="x")
+
+
+def integrated(factors):
+    return ct.ss(0.0, [[*factors, 1.0]], 1.0, 0.0, inputs=["w0", "w1", "r"], outputs="x", name="moved")
+
+
+def added(factors):
+    return ct.ss([], [], [], [[*factors, 1.0]], inputs=["w0", "w1", "r"], outputs="x", name="total", dt=None)
+
+
+def sums(first, second, end):
+    """Counts of both delays with a sum up to the end, the sum, and the number of orders in which they add up."""
+    for n in range(int(end / first) + 1):
+        for m in range(int((end - n * first) / second) + 1):
+            yield n, m, n * first + m * second, math.comb(n + m, n)
+
+
+@pytest.mark.parametrize(("first", "second"), [(1.0, math.sqrt(2.0)), (0.3, 0.50031)])
+def test_delays_without_a_common_divisor(first, second):
+    """x' = a x(t - first) + b x(t - second) + r from 1: powers of the time since each sum of the delays."""
+    a, b, end = -0.7, -0.4, 12.0
+    times = np.unique(np.append(np.random.default_rng(0).uniform(0.0, end, 20), [0.0, first, second, end]))
+    found = cp.simulate(two_delays(first, second, (a, b), integrated), times, 1.0, 1.0)
+    with mp.workdps(30):  # terms of 1e5 cancel
+        expected = [mp.mpf(0)] * times.size
+        for n, m, moment, ways in sums(mp.mpf(first), mp.mpf(second), end):
+            k = n + m
+            since = [max(mp.mpf(t) - moment, 0) for t in times.tolist()]
+            factor = ways * mp.mpf(a) ** n * mp.mpf(b) ** m / mp.factorial(k)
+            own = [factor * (s**k + s ** (k + 1) / (k + 1)) if s or not k else 0 for s in since]
+            expected = [total + x for total, x in zip(expected, own, strict=True)]
+    expected = np.array(expected, dtype=float)
+    assert (found.method, found.reason) == ("exact", "linear, with delays")
+    assert np.abs(found.outputs - expected).max() <= 3e-14 * np.abs(expected).max()
+
+
+def test_jumps_return_after_every_sum_of_delays():
+    """x = a x(t - 1) + b x(t - sqrt(2)) + r: a step of r returns as a step after each sum, never smoother."""
+    first, second, end = 1.0, math.sqrt(2.0), 15.0
+    loop = two_delays(first, second, (-0.5, 0.3), added)
+    marks = np.array([moment for _, _, moment, _ in sums(first, second, end)])
+    times = np.unique(np.concatenate([np.random.default_rng(0).uniform(0.0, end, 50), marks, [end]]))
+    found = cp.simulate(loop, times, 1.0)
+    expected = sum(
+        ways * (-0.5) ** n * 0.3**m * (times >= moment - 1e-12) for n, m, moment, ways in sums(first, second, end)
+    )
+    assert found.method == "exact"
+    assert np.abs(found.outputs - expected).max() <= 1e-14
+
+
+def test_too_many_sums_of_delays_are_not_exact():
+    loop = two_delays(1.0, math.sqrt(2.0), (-0.5, 0.3), added)
+    with pytest.raises(ValueError, match=r"delays of 1, 1\.41421 s, sample times .* and have more than 20000 sums"):
+        cp.simulate(loop, [0.0, 250.0], 1.0, method="exact")
+
+
+def test_a_run_by_small_steps():
+    """x'' = -x' - 2 x(t - 0.3) + x(t - 0.41421) + r by hand, steps of fourth order, with the interpolant of Hermite."""
+    first, second, step, end = 0.3, math.sqrt(2.0) - 1.0, 2e-3, 4.0
+    moved = ct.ss(
+        [[0.0, 1.0], [0.0, -1.0]], [[0.0] * 3, [-2.0, 1.0, 1.0]], [[1.0, 0.0]], 0, inputs=["w0", "w1", "r"], outputs="x"
+    )
+    loop = two_delays(first, second, (), lambda _: moved)
+    times = np.linspace(0.0, end, 21)
+    found = cp.simulate(loop, times, 1.0)
+    count = round(end / step)
+    x, y = np.zeros(2), np.zeros((count + 2, 2))
+
+    def past(t):
+        if t < -1e-12:
+            return 0.0
+        k = int(t / step + 1e-9)
+        s = t / step - k
+        (p, v), (q, w) = y[k], y[k + 1]
+        return p + s * (step * v + s * (3.0 * (q - p) - step * (2.0 * v + w) + s * (2.0 * (p - q) + step * (v + w))))
+
+    def rate(t, z):
+        return np.array([z[1], -z[1] - 2.0 * past(t - first) + past(t - second) + 1.0])
+
+    for k in range(count):
+        t = k * step
+        k1 = rate(t, x)
+        k2 = rate(t + 0.5 * step, x + 0.5 * step * k1)
+        k3 = rate(t + 0.5 * step, x + 0.5 * step * k2)
+        x = x + step / 6.0 * (k1 + 2.0 * (k2 + k3) + rate(t + step, x + step * k3))
+        y[k + 1] = x
+    by_hand = y[: count + 1 : count // 20, 0]
+    assert found.method == "exact"
+    # Jumps of x''(t - second) lie inside of steps: an error of their third power.
+    assert np.abs(found.outputs - by_hand).max() <= step**3
 
 
 @pytest.mark.parametrize(("delay", "offset"), [(0.13, 0.0), (0.4, 0.03)])

@@ -277,7 +277,7 @@ def test_the_exact_method_rejects_them(system):
     bent = ct.nlsys(None, lambda t, x, u, p: np.tanh(u), inputs="r", outputs="y", dt=0.5, name="b")
     cases = {
         "sampled": (cp.sample_hold(bent, 0.5), "block b, which is sampled, is not linear"),
-        "delayed": (integrators([1.0, math.sqrt(0.5)], [-1.0, 0.5]), "delays of 1, 0.707107 s, sample times and"),
+        "delayed": (integrators([1e-6, math.sqrt(0.5)], [-1.0, 0.5]), "delays of 1e-06, 0.707107 s, sample times and"),
     }
     loop, reason = cases[system]
     with pytest.raises(ValueError, match=f'method "exact".*{reason}'):
