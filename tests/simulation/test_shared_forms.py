@@ -1,6 +1,7 @@
 """Loops that differ in their sources only are compiled once in a context of `shared_forms`."""
 
 import math
+from itertools import pairwise
 
 import control as ct
 import numpy as np
@@ -119,7 +120,7 @@ def test_times_of_events_divide_the_intervals_of_samples():
         found = with_event_times(times, event, lambda: np.zeros((1, 1)))
         assert np.isin(times, found).all()
         assert np.diff(found).max() <= np.ptp(times) / 399 * (1.0 + 1e-9)
-        for left, right in zip(times[:-1], times[1:], strict=True):
+        for left, right in pairwise(times.tolist()):
             inside = found[(left <= found) & (found <= right)]
             np.testing.assert_allclose(np.diff(inside), (right - left) / (inside.size - 1), rtol=1e-9)
     dense = np.linspace(0.0, 1.0, 2001)
