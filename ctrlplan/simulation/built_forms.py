@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctrlplan._lru import BUILDING
+from ctrlplan._lru import BUILDING, Lru
 from ctrlplan._types import Params
 from ctrlplan.symbolic.fingerprint import value_token
 
@@ -60,6 +62,52 @@ class BuiltForm:
         )
 
 
+@contextmanager
+def shared_forms() -> Iterator[None]:
+    """Compile loops with equal blocks and connections once in a context, as those of several plans.
+
+    A loop that differs in its sources and in the times, states and parameters of
+    its runs has the same equations. Contexts inside another one share its forms.
+    """
+    if _SHARED.get() is not None:
+        yield
+        return
+    token = _SHARED.set(Lru(_CACHE_SIZE))
+    try:
+        yield
+    finally:
+        _SHARED.reset(token)
+
+
+_SHARED: ContextVar[Lru[tuple[object, ...], BuiltForm] | None] = ContextVar("shared", default=None)
+
+
+def built_once(structure: Callable[[], tuple[object, ...] | None], build: Callable[[], BuiltForm]) -> BuiltForm:
+    """Form of a structure, built once in a context of `shared_forms`; every time for the structure None."""
+    shared = _SHARED.get()
+    key = None if shared is None else structure()
+    if shared is None or key is None:
+        return build()
+    try:
+        return shared.get(key, lambda: _compiled(build()))
+    except _NotBuiltError as error:
+        return error.form
+
+
+class _NotBuiltError(Exception):
+    """There is no compiled form; the reason may depend on the run."""
+
+    def __init__(self, form: BuiltForm) -> None:
+        super().__init__(str(form.form))
+        self.form = form
+
+
+def _compiled(built: BuiltForm) -> BuiltForm:
+    if isinstance(built.form, NotCompiledError):
+        raise _NotBuiltError(built)
+    return built
+
+
 class BuiltForms:
     """Compiled forms of one system and results of trial calls; thread-safe.
 
@@ -93,6 +141,9 @@ class BuiltForms:
 
     def discard(self, form: Compiled, why: str) -> DisagreementError:
         """Discard a wrong form; it may be rebuilt once, since its functions may have changed."""
+        shared = _SHARED.get()
+        if shared is not None:
+            shared.clear()
         with BUILDING:
             retained = []
             for entry in self.forms:

@@ -29,8 +29,8 @@ Stats = Mapping[str, float]
 _CACHE_SIZE = 64
 """Number of cached integrators, one for each pattern of output times, and of cached functions of many times."""
 
-_FEW = 64
-"""Number of output times up to which the pattern is rounded, so that segments of one length share an integrator."""
+_DIGITS, _APART = 12, 1e-9
+"""Digits of output times in units of a segment, and their distance above which they are rounded to these digits."""
 
 _FEW_STEPS = 2_000
 """Maximum number of steps between outputs in the first attempt."""
@@ -332,9 +332,7 @@ class CompiledSolver:
         if not moving.size:
             return out
         right = float(grid[-1])
-        relative = (grid - left) / (right - left)
-        if grid.size <= _FEW:  # rounding errors of time must not require a new integrator for every short segment
-            relative = np.round(relative, 12)
+        relative = _pattern((grid - left) / (right - left))
         if right - left > self._longest:
             decay = self.form.fastest_decay(left, state, series(left), self._p)
             self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
@@ -431,6 +429,12 @@ def _called(
     if report is not None:
         report(getattr(buffer, "stats", dict)())
     return out.T
+
+
+def _pattern(relative: Array) -> Array:
+    """Relative output times of a segment; rounded, as rounding errors of time must not require a new integrator."""
+    rounded = np.round(relative, _DIGITS)
+    return rounded if relative.size == 1 or np.diff(rounded).min() > _APART else relative
 
 
 def _feedthrough(block: Block, trace: Trace | None) -> NDArray[np.bool_]:

@@ -115,11 +115,14 @@ def equilibrium_state(system: System | Prepared, position: ArrayLike) -> Array:
         if there is none.
     """
     held = np.atleast_1d(real_array(position, "position"))
-    start = np.zeros(system.nstates or 0)
     try:
-        form = _form(system)
+        return equilibrium_of(_form(system), held)
     except NotLinearError:
-        return start
+        return np.zeros(system.nstates or 0)
+
+
+def equilibrium_of(form: LinearForm, held: Array) -> Array:
+    """Equilibrium (nstates,) of a linear loop, as `equilibrium_state`, for inputs (ninputs,)."""
     if form.b.shape[1] != held.size or not held.any():
         return np.zeros(len(form.a))
     c, d, free = form.c[: held.size], form.d[: held.size], np.ones(len(form.a), dtype=bool)

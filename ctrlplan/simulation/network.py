@@ -23,7 +23,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from ctrlplan._types import Array, BlockMap, Params, System, Value
+from ctrlplan.symbolic.fingerprint import array_token, roots_of
 from ctrlplan.symbolic.isolation import untouched
+from ctrlplan.symbolic.references import References
 from ctrlplan.symbolic.trials import can_remember, of_library, reads, trial_copy, values_of
 from ctrlplan.traits import BlockFunction, BlockTraits, traits_of
 from ctrlplan.trajectories import Trajectory
@@ -349,6 +351,27 @@ class Network:
 
     def _owners(self, rows: NDArray[np.intp]) -> tuple[int, ...]:
         return tuple(i for i, place in enumerate(self.outputs) if np.any((rows >= place.start) & (rows < place.stop)))
+
+
+def structure(block: Block, params: Params) -> tuple[object, ...] | None:
+    """What the compiled equations of a block depend on, by value; None if that is unknown.
+
+    Parameters
+    ----------
+    block : Block
+        The block.
+    params : mapping
+        Parameters of a run.
+    """
+    system = block.system
+    sizes = system.nstates or 0, system.ninputs or 0, system.noutputs
+    if block.linear:
+        return sizes, *(array_token(matrix) for matrix in (system.A, system.B, system.C, system.D))
+    if block.is_time_function:
+        return sizes, "delay" if block.delay is not None else "plan"
+    found = References([*roots_of(system), ("params", {**block.params, **params})])
+    unknown = found.opaque or block.period is not None or block.traits.block is not None
+    return None if unknown else (sizes, block.changes_unseen, found.tokens, found.cached)
 
 
 def known_feedthrough(block: Block) -> NDArray[np.bool_] | None:

@@ -14,17 +14,23 @@ from ctrlplan._checks import check_kind
 from ctrlplan._display import Displayed, Facts, Part, counted
 from ctrlplan._lru import BUILDING, Lru
 from ctrlplan._types import Array, Params, System, Value
-from ctrlplan.simulation.built_forms import BuiltForm, BuiltForms, DisagreementError, NotCompiledError
+from ctrlplan.simulation.built_forms import (
+    BuiltForm,
+    BuiltForms,
+    DisagreementError,
+    NotCompiledError,
+    built_once,
+)
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
-from ctrlplan.simulation.network import Block, Network, UnsupportedError
+from ctrlplan.simulation.network import Block, Network, UnsupportedError, structure
 from ctrlplan.simulation.sampled_form import DelayedForm, SampledForm, delayed_form, sampled_form
 from ctrlplan.simulation.segments import DelayedSignal
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
 from ctrlplan.simulation.starts import command_starts
 from ctrlplan.simulation.unread import is_read
 from ctrlplan.symbolic import missing_casadi
-from ctrlplan.symbolic.fingerprint import fingerprint, value_token
+from ctrlplan.symbolic.fingerprint import array_token, fingerprint, value_token
 from ctrlplan.symbolic.keeper import Keeper
 from ctrlplan.traits import traits_of
 
@@ -166,7 +172,9 @@ class Prepared(Displayed):
         """
 
         def build() -> BuiltForm:
-            built = self._build(params, time_signals, first, state, trials)
+            built = built_once(
+                lambda: self._structure(params), lambda: self._build(params, time_signals, first, state, trials)
+            )
             if self.original is not None:  # the trace has shown which objects the blocks only write
                 self.fingerprint = fingerprint(self.original)
                 _FORMS.get(self.fingerprint, lambda: self)
@@ -302,6 +310,14 @@ class Prepared(Displayed):
         except NotTraceableError as error:
             every = {key: value_token(value) for key, value in params.items()}
             return BuiltForm(names, every, NotCompiledError(str(error)))
+
+    def _structure(self, params: Params) -> tuple[object, ...] | None:
+        """What the compiled form depends on, by value; None if it cannot be shared with other systems."""
+        network = self.network
+        parts = None if network is None else [structure(block, params) for block in network.blocks]
+        if network is None or not parts or None in parts:
+            return None
+        return network.ninputs, array_token(network.wire), array_token(network.read), *parts
 
     def _signals_at_start(
         self,

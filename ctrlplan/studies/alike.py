@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan._types import Array
-from ctrlplan.simulation import equilibrium_state, state_space, stated_start
+from ctrlplan.simulation import state_space, stated_start
+from ctrlplan.simulation.equilibrium import equilibrium_of
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_form
 from ctrlplan.studies.running import System, acting_outputs, tracked_outputs
@@ -78,7 +79,7 @@ def numbers_of(
             state = np.broadcast_to(real_array(initial_state, "initial_state"), (system.nstates,))
             starts = dict.fromkeys(held, state)
         else:
-            starts = {name: equilibrium_state(system, position) for name, position in held.items()}
+            starts = {name: equilibrium_of(form, position) for name, position in held.items()}
     except (AttributeError, TypeError, ValueError):  # reported when the loop is run separately
         return None
     if initial_state is None and not _at_rest(form, starts, held):

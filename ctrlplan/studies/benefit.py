@@ -18,6 +18,7 @@ from ctrlplan.planning.bounds import limit_words
 from ctrlplan.planning.limits import Limited
 from ctrlplan.planning.quantities import System as Quantified
 from ctrlplan.simulation import state_space
+from ctrlplan.simulation.built_forms import shared_forms
 from ctrlplan.studies.baselines import baseline_plans, derivative_limits, peak_limits, profiles
 from ctrlplan.studies.comparison import Comparison, comparison_of, finite_or_none
 from ctrlplan.studies.experiment import Experiment, Measured
@@ -222,6 +223,7 @@ def benefit(
     return benefit_of(comparison.experiment, loop, choices, units=comparison.units)
 
 
+@shared_forms()
 def benefit_of(
     experiment: Experiment,
     loop: System | Builder,

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from functools import partial
 
+import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._lru import Lru
 from ctrlplan._types import System
-from ctrlplan.simulation import prepared_form
+from ctrlplan.simulation import Prepared, prepared_form
 from ctrlplan.simulation.network import Block, Network
 from ctrlplan.trajectories import Trajectory
 
@@ -39,6 +42,33 @@ def check_reached(system: System, outputs: Sequence[str], plan: Trajectory | Non
         `outputs`, another source inside affects no output at all, or an input
         for a derivative of a source is not connected.
     """
+    structure = None if isinstance(system, Prepared) else _structure(system)
+    if structure is None:
+        _check_network(system, outputs, plan)
+    else:  # many loops of a sweep differ in numbers only
+        _REACHED.get((tuple(outputs), structure), partial(_check_network, system, outputs, plan))
+
+
+_REACHED: Lru[tuple[object, ...], None] = Lru(16)
+"""Outputs and structures of linear loops in which references reach these outputs."""
+
+
+def _structure(system: System) -> tuple[object, ...] | None:
+    """Labels, connections and nonzero entries of a loop of linear blocks; None for others."""
+    labels = tuple(system.input_labels or ()), tuple(system.output_labels or ())
+    if isinstance(system, ct.InterconnectedSystem):
+        parts = [_structure(block) for block in system.syslist]
+        maps = [np.asarray(found) for found in (system.connect_map, system.input_map, system.output_map)]
+        tokens = tuple((entries.shape, entries.tobytes()) for entries in maps)
+        return None if None in parts else (labels, tokens, *parts)
+    if not isinstance(system, ct.StateSpace):
+        return None
+    matrices = [np.asarray(matrix) for matrix in (system.A, system.B, system.C, system.D)]
+    return labels, tuple((entries.shape, (entries != 0.0).tobytes()) for entries in matrices)
+
+
+def _check_network(system: System, outputs: Sequence[str], plan: Trajectory | None) -> None:
+    """Raise as `check_reached`."""
     network = prepared_form(system).network
     if network is None or not network.blocks:
         return

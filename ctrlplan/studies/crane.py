@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ctrlplan import metrics
 from ctrlplan.planning import Fastest, avoid
 from ctrlplan.simulation import simulate
+from ctrlplan.simulation.built_forms import shared_forms
 from ctrlplan.studies.choosing import (
     LOAD_RADIUS,
     MARGIN,
@@ -68,6 +69,7 @@ class _Loop(DriveLimits, total=False):
     law: LawName
 
 
+@shared_forms()
 def crane_nominal_study(progress: bool = True) -> Study:
     """Simulation 1 (figure 4): a point-to-point move."""
     points = nominal_waypoints()
@@ -138,6 +140,7 @@ def _nominal_sections(points: tuple[Waypoint, Waypoint], limited: Fastest) -> tu
     )
 
 
+@shared_forms()
 def crane_first_order_study(progress: bool = True) -> Study:
     """Simulation 2 (figure 5): only first-order data."""
     points = first_order_waypoints()
@@ -178,6 +181,7 @@ def crane_first_order_study(progress: bool = True) -> Study:
     )
 
 
+@shared_forms()
 def crane_obstacle_study(progress: bool = True) -> Study:
     """Simulation 3 (figure 6): over a wall through two via points."""
     points = obstacle_waypoints()

@@ -16,6 +16,7 @@ from ctrlplan._checks import real_array
 from ctrlplan._display import Displayed, Facts, Part, counted, title_of
 from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event
+from ctrlplan.simulation.built_forms import shared_forms
 from ctrlplan.studies.alike import Linear, numbers_of, outputs_together
 from ctrlplan.studies.checkpoint import digest
 from ctrlplan.studies.measures import (
@@ -263,7 +264,8 @@ class Experiment(Displayed):
         """
         if not is_builder(loop):
             check_has_inputs(loop)
-        found, failures = _each(lambda name: self.run_plan(loop, name), list(self.plans))
+        with shared_forms():  # loops built for the plans differ in their sources only
+            found, failures = _each(lambda name: self.run_plan(loop, name), list(self.plans))
         metrics = {name: values for name, (_, values) in found.items()}
         return Measured(metrics, {name: run for name, (run, _) in found.items()}, failures)
 

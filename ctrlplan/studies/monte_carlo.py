@@ -15,7 +15,7 @@ from typing import Protocol, TypeAlias, TypeGuard
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import real_array
+from ctrlplan._checks import check_kind, real_array
 from ctrlplan._lru import Lru
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params
@@ -108,7 +108,7 @@ def monte_carlo(
     Raises
     ------
     TypeError
-        If `executor` has no ``submit``.
+        If `executor` has no ``submit``, or `draws` is no mapping.
     RuntimeError
         If a worker has other versions of ctrlplan or casadi.
     ValueError
@@ -176,6 +176,7 @@ def monte_carlo(
 
 
 def _checked_draws(draws: Mapping[str, ArrayLike]) -> dict[str, Array]:
+    check_kind(draws, "draws", Mapping, "a mapping of names to values, as the function draws returns it")
     table = {name: np.atleast_1d(real_array(values, f"draws[{name!r}]")) for name, values in draws.items()}
     sizes = {name: values.shape for name, values in table.items()}
     if not table or len(set(sizes.values())) != 1 or any(len(shape) != 1 or not shape[0] for shape in sizes.values()):

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import control as ct
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ctrlplan._types import System
 from ctrlplan.symbolic.references import References
@@ -64,6 +65,12 @@ def _referred(system: System) -> tuple[object, ...]:
 def value_token(value: object) -> tuple[object, ...]:
     """Fingerprint of a parameter."""
     return References([("params", value)]).tokens
+
+
+def array_token(values: ArrayLike) -> tuple[object, ...]:
+    """Fingerprint of an array of numbers."""
+    array = np.asarray(values, dtype=float)
+    return array.shape, array.tobytes()
 
 
 def roots_of(system: System) -> Iterator[tuple[str, object]]:

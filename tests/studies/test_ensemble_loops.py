@@ -59,6 +59,12 @@ def test_there_are_as_many_draws_of_each_parameter(params):
         run(lag(), params)
 
 
+@pytest.mark.parametrize("params", [[1.0, 2.0], "tau", None])
+def test_draws_are_a_mapping(params):
+    with pytest.raises(TypeError, match=r"draws must be a mapping of names to values, .* got "):
+        run(lag(), params)
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_draws_are_finite(value):
     with pytest.raises(ValueError, match=r"draws must be finite, got (nan|inf|-inf) of 'tau'"):

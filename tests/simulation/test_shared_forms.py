@@ -1,0 +1,127 @@
+"""Loops that differ in their sources only are compiled once in a context of `shared_forms`."""
+
+import math
+from itertools import pairwise
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlplan as cp
+from ctrlplan.simulation import compiled
+from ctrlplan.simulation.built_forms import NotApplicableError, shared_forms
+from ctrlplan.simulation.job import with_event_times
+
+pytest.importorskip("casadi")
+TIMES = np.linspace(0.0, 4.0, 81)
+PLANS = {
+    "polynomial": cp.PolySpline([cp.Waypoint(0.0, 0.0, 0.0), cp.Waypoint(1.0, 1.0, 0.0)]),
+    "trigonometric": cp.TrigSpline([cp.Waypoint(0.0, 0.0, 0.0), cp.Waypoint(1.5, 2.0, 0.0)], alpha=1.0),
+}
+
+
+def damped(plan, rate=2.0):
+    """x' = rate (r - x) - x^3, with the source of r inside."""
+
+    def update(t, x, u, params):
+        return [rate * (u[0] - x[0]) - x[0] ** 3]
+
+    return fed(plan, update)
+
+
+def fed(plan, update):
+    block = ct.nlsys(update, None, inputs=["r"], outputs=["y"], states=1, name="damped")
+    source = cp.create_source_iosystem(cp.stack([plan], labels=["r"]), suffix="", name="plan")
+    return ct.interconnect([source, block], inputs=0, outputs=["y"])
+
+
+@pytest.fixture
+def built(monkeypatch):
+    """Networks that were compiled."""
+    networks, whole = [], compiled.Compiled.__init__
+
+    def init(self, network, traces):
+        networks.append(network)
+        whole(self, network, traces)
+
+    monkeypatch.setattr(compiled.Compiled, "__init__", init)
+    return networks
+
+
+def reference(plan, rate):
+    """The same by classical Runge-Kutta steps of 1/400 s, which end where the plans end; error below 1e-9."""
+    x, h, found = 0.0, 1.0 / 400.0, [0.0]
+
+    def slope(t, x):
+        return rate * (float(plan(t)) - x) - x**3
+
+    for k in range(20 * (TIMES.size - 1)):
+        t = k * h
+        a = slope(t, x)
+        b = slope(t + h / 2, x + h / 2 * a)
+        c = slope(t + h / 2, x + h / 2 * b)
+        x += h / 6 * (a + 2 * b + 2 * c + slope(t + h, x + h * c))
+        if (k + 1) % 20 == 0:
+            found.append(x)
+    return np.array(found)
+
+
+def test_loops_with_other_plans_share_a_form(built):
+    with shared_forms():
+        for plan in PLANS.values():
+            found = cp.simulate(damped(plan), TIMES, method="compiled")
+            assert np.abs(found.outputs - reference(plan, 2.0)).max() <= 1e-7
+    assert len(built) == 1
+
+
+def test_without_the_context_each_loop_has_its_own(built):
+    for plan in PLANS.values():
+        cp.simulate(damped(plan), TIMES, method="compiled")
+    assert len(built) == 2
+
+
+def test_another_number_in_a_function_is_another_form(built):
+    plan = PLANS["polynomial"]
+    with shared_forms():
+        for rate in (2.0, 3.0, 2.0):
+            found = cp.simulate(damped(plan, rate), TIMES, method="compiled")
+            assert np.abs(found.outputs - reference(plan, rate)).max() <= 1e-7
+    assert len(built) == 2
+
+
+def test_a_context_inside_another_one_shares_its_forms(built):
+    with shared_forms():
+        for plan in PLANS.values():
+            with shared_forms():
+                cp.simulate(damped(plan), TIMES, method="compiled")
+    assert len(built) == 1
+
+
+def test_compare_compiles_a_loop_once(built):
+    cp.compare(lambda name, plan: damped(plan), PLANS, TIMES, outputs=["y"])
+    assert len(built) == 1
+
+
+def test_a_block_that_cannot_be_compiled_is_tried_in_each_loop(built):
+    def branching(t, x, u, params):
+        return [math.copysign(1.0, u[0] - x[0])]
+
+    with shared_forms():
+        for plan in PLANS.values():
+            with pytest.raises(NotApplicableError, match="damped cannot be traced"):
+                cp.simulate(fed(plan, branching), TIMES, method="compiled")
+    assert not built
+
+
+def test_times_of_events_divide_the_intervals_of_samples():
+    """No interval is longer than 1/399 of the run, and equal intervals are divided equally."""
+    event = [object()]
+    for times in (np.linspace(0.0, 10.0, 101), np.array([0.0, 0.3, 5.0, 5.001, 9.0])):
+        found = with_event_times(times, event, lambda: np.zeros((1, 1)))
+        assert np.isin(times, found).all()
+        assert np.diff(found).max() <= np.ptp(times) / 399 * (1.0 + 1e-9)
+        for left, right in pairwise(times.tolist()):
+            inside = found[(left <= found) & (found <= right)]
+            np.testing.assert_allclose(np.diff(inside), (right - left) / (inside.size - 1), rtol=1e-9)
+    dense = np.linspace(0.0, 1.0, 2001)
+    assert with_event_times(dense, event, lambda: np.zeros((1, 1))) is dense
