@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -9,14 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_count, checked_vector, real_array
-from ctrlplan.trajectories.common import FACTORIALS, Array
+from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers
 from ctrlplan.trajectories.piecewise_polynomial import PiecewisePolynomial
+from ctrlplan.trajectories.swing import MAXIMUM_SWING
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
 
 _DEGREES = (1, 3, 3, 5, 5)
 """Degree of the spline by the highest continuous derivative; even degrees are ill-conditioned."""
+
+_ROUNDING = 1e-9
+"""Part of a tolerance for the rounding of the polynomials of a spline."""
 
 _PARTS = 16
 """Maximum number of parts into which an interval between knots is divided in one step."""
@@ -30,6 +35,7 @@ def fit(
     smoothing: ArrayLike | None = None,
     continuity: int = 2,
     labels: Sequence[str] | str | None = None,
+    warn: bool = True,
 ) -> PiecewisePolynomial:
     """Plan through samples: an interpolating or smoothing spline.
 
@@ -54,6 +60,8 @@ def fit(
         Highest derivative that is continuous, from 0 (linear between samples) to 4.
     labels : sequence of str, optional
         Names of the axes.
+    warn : bool, optional
+        Whether to warn if the plan swings far beyond the samples.
 
     Returns
     -------
@@ -70,6 +78,12 @@ def fit(
         If shapes differ, a sample is not finite, times do not increase strictly, or
         there are too few samples for the continuity; if `tolerance` and `smoothing`
         are both given; if the tolerance would require more knots than samples.
+
+    Warns
+    -----
+    UserWarning
+        If the range of the plan is more than 3 times that of the samples, as between
+        times that are spaced very unevenly.
 
     Notes
     -----
@@ -103,8 +117,53 @@ def fit(
     table = np.empty((degree + 1, knots.size - 1, len(rows)))
     for k in range(degree + 1):
         table[-1 - k] = np.concatenate([spline(knots[:-1], nu=k) for spline in splines], axis=1) / FACTORIALS[k]
-    deviation = np.abs(np.concatenate([spline(moments) for spline in splines], axis=1).T - rows).max(axis=1)
-    return PiecewisePolynomial(knots, table, labels=labels, deviation=deviation)
+    deviation = np.abs(_values(knots, table, moments) - rows.T).max(axis=0)
+    if allowed is not None and (deviation > allowed).any():
+        axis = int((deviation / allowed).argmax())
+        raise ValueError(
+            f"tolerance must be at least {deviation[axis]:.3g}, the deviation by rounding of a spline through all "
+            f"samples of axis {axis}, got {allowed[axis]:g}: it would require more knots than the {moments.size} "
+            "samples"
+        )
+    plan = PiecewisePolynomial(knots, table, labels=labels, deviation=deviation)
+    if warn:
+        _warn_of_swing(plan, rows)
+    return plan
+
+
+def _values(knots: Array, table: Array, times: Array) -> Array:
+    """Values (ntime, naxes) of the polynomials themselves, whose coefficients are rounded."""
+    segments = np.searchsorted(knots[1:-1], times, side="right")
+    s = (times - knots[segments])[:, None]
+    found = table[0].take(segments, axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for row in table[1:]:
+            found = found * s + row.take(segments, axis=0)
+    return found
+
+
+def _warn_of_swing(plan: PiecewisePolynomial, rows: Array) -> None:
+    """Warn at the line of the caller's caller if a plan swings far beyond its samples (naxes, nsamples)."""
+    low, high = rows.min(axis=1), rows.max(axis=1)
+    allowed = MAXIMUM_SWING * (high - low) + 1e-9 * np.abs(rows).max(axis=1)  # rounding of constant samples
+    powers = np.arange(len(plan.coefficients))
+    with np.errstate(over="ignore", invalid="ignore"):
+        relative = plan.coefficients[::-1] * (np.diff(plan.breakpoints) ** powers[:, None])[:, :, None]
+        bounds = np.tensordot(bernstein_of_powers(int(powers[-1])), relative, 1)
+        if (bounds.max(axis=0).max(axis=0) - bounds.min(axis=0).min(axis=0) <= allowed).all():
+            return
+    found = plan.extrema()
+    excess = np.where(found.maximum - found.minimum > allowed, (found.maximum - found.minimum) / allowed, 0.0)
+    axis = int(excess.argmax())
+    if excess[axis]:
+        factor = MAXIMUM_SWING * excess[axis]
+        warnings.warn(
+            f"the plan swings over {factor:.3g} times the range of the samples: {plan.labels[axis]} from "
+            f"{found.minimum[axis]:.6g} to {found.maximum[axis]:.6g}, where samples stay from {low[axis]:.6g} to "
+            f"{high[axis]:.6g}; lower continuity, use a larger tolerance or smoothing, or PiecewiseSpline, or pass "
+            "warn=False if this is intended",
+            stacklevel=3,
+        )
 
 
 def _checked_continuity(continuity: int) -> int:
@@ -188,21 +247,13 @@ def _within(times: Array, rows: Array, degree: int, limits: Array) -> BSpline:
         except np.linalg.LinAlgError:  # times that are spaced too unevenly for the normal equations
             break
         with np.errstate(over="ignore", invalid="ignore"):
-            excess = (np.abs(spline(times) - rows.T) / limits).max(axis=1)
+            excess = (np.abs(spline(times) - rows.T) / (limits * (1.0 - _ROUNDING))).max(axis=1)
         if (excess <= 1.0).all():
             return spline
         if not np.isfinite(excess).all():
             break
         chosen = _divided(chosen, np.maximum.reduceat(excess[:-1], chosen[:-1]), degree)
-    spline = _interpolating(times, rows.T, degree)
-    left = np.abs(spline(times).T - rows).max(axis=1)
-    if (left > limits).any():
-        axis = int((left / limits).argmax())
-        raise ValueError(
-            f"tolerance must be at least {left[axis]:.3g}, the deviation by rounding of a spline through all samples "
-            f"of axis {axis}, got {limits[axis]:g}: it would require more knots than the {times.size} samples"
-        )
-    return spline
+    return _interpolating(times, rows.T, degree)
 
 
 def _divided(chosen: NDArray[np.intp], worst: Array, degree: int) -> NDArray[np.intp]:

@@ -14,7 +14,7 @@ from ctrlplan._checks import checked_count, checked_finite, real_array
 from ctrlplan._display import Displayed, Facts, Part, number
 from ctrlplan._types import Value
 from ctrlplan.trajectories.chosen import checked_alpha
-from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale
+from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale, readonly
 from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.one_time import newton_series, pair_series
@@ -97,8 +97,8 @@ class Transition(Displayed, Fields):
             _rows=family.rows,
             _matrix=None
             if family.matrix is None
-            else family.matrix * (powers[family.jet_orders] * family.jet_inverse) / powers[:, None],
-            _powers=powers,
+            else readonly(family.matrix * powers[family.jet_orders] / powers[:, None]),
+            _powers=readonly(powers),
         )
 
     def _describe(self) -> Iterator[Part]:
@@ -130,7 +130,13 @@ class Transition(Displayed, Fields):
         return self.coefficients_of_row(jets.ravel().tolist())
 
     def coefficients_of_row(self, jets: Sequence[float]) -> Array:
-        """Coefficients, as `coefficients`, of jets in one sequence: all axes of one derivative after another."""
+        """Coefficients of jets in one sequence, as `coefficients`.
+
+        Parameters
+        ----------
+        jets : sequence of float, length 2 (order + 1) naxes
+            All axes of one derivative after another, at the start, then at the end.
+        """
         naxes, own = len(jets) // len(self._rows), list(jets)
         if self._matrix is None:
             data = np.array(own).reshape(-1, naxes)[self._rows]
@@ -195,8 +201,7 @@ class _Family(NamedTuple):
     rows: NDArray[np.intp]  # of the jets at both ends, in the order of the system
     exponents: Array
     jet_orders: NDArray[np.intp]  # of the jets at both ends
-    jet_inverse: Array  # of their factorials
-    matrix: Array | None  # from Taylor data of the jets to coefficients; None if that loses digits
+    matrix: Array | None  # from jets to coefficients; None if that loses digits
 
 
 @lru_cache(maxsize=4096)
@@ -205,13 +210,13 @@ def _family(order: int, alpha: float) -> _Family:
     given = tuple(range(order + 1))
     system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
     rows = system.waypoint_index * (order + 1) + system.order_index
-    matrix = None
+    matrix, orders = None, np.arange(2 * order + 2) % (order + 1)
     if system.amplification < _AMPLIFIED and alpha < NEARLY_CLOSED:
         matrix = system.coefficients(np.eye(len(rows)))[:, np.argsort(rows)].copy()
         # A position at both ends is that of a constant.
         matrix[:, 0] = np.eye(len(rows))[0]
-    orders = np.arange(2 * order + 2) % (order + 1)
-    return _Family(system, rows, np.arange(2.0 * order + 2.0), orders, 1.0 / FACTORIALS[orders], matrix)
+        matrix /= FACTORIALS[orders]
+    return _Family(system, rows, np.arange(2.0 * order + 2.0), orders, matrix)
 
 
 @lru_cache(maxsize=4096)

@@ -25,13 +25,39 @@ def deviation(plan, values):
 def test_tolerance_is_met_at_every_sample(continuity, noisy, share):
     values = NOISY if noisy else WAVE
     limits = share * np.array([0.02, 2.0])
-    plan = cp.fit(T, values, tolerance=limits, continuity=continuity, labels=["x", "z"])
+    plan = cp.fit(T, values, tolerance=limits, continuity=continuity, labels=["x", "z"], warn=False)
     found = deviation(plan, values)
     assert (found <= limits * (1 + 1e-12)).all()
     assert (np.abs(plan.deviation - found) <= 1e-13 * np.abs(values).max(axis=1)).all()
     assert [jump for jump in plan.jumps(continuity) if plan.start < jump.time < plan.end] == []
     assert plan.breakpoints.size <= T.size
     assert (plan.start, plan.end, plan.labels) == (T[0], T[-1], ("x", "z"))
+
+
+def test_a_swing_between_uneven_times_warns():
+    """Quintics through pairs of near samples: their slopes, not the range of the samples, determine the plan."""
+    times = np.ravel([(k, k + 1e-4) for k in range(10)])
+    values = np.resize([0.0, 1.0], times.size)
+    with pytest.warns(UserWarning, match=r"swings over \S+ times the range of the samples: y from .* lower continuity"):
+        plan = cp.fit(times, values, continuity=3)
+    samples = plan(np.linspace(plan.start, plan.end, 20_001))
+    assert np.ptp(samples) > 100.0
+    assert (np.abs(plan(times) - values) <= plan.deviation + 1e-14 * np.abs(samples).max()).all()
+    for quiet in ({"continuity": 3, "warn": False}, {"continuity": 0}):
+        cp.fit(times, values, **quiet)  # a warning would be an error
+
+
+def test_the_deviation_is_that_of_the_plan():
+    """Rounded coefficients of far swings, not the B-spline from which they are computed."""
+    rng = np.random.default_rng(3)
+    times = np.cumsum(rng.choice([1e-3, 1.0], 60) * rng.uniform(0.2, 1.0, 60))
+    values = np.cumsum(rng.normal(size=60))
+    plan = cp.fit(times, values, continuity=4, warn=False)
+    found = np.abs(plan(times) - values).max()
+    assert found > 1e-9
+    assert 0.5 * found <= plan.deviation[0] <= 2.0 * found
+    with pytest.raises(ValueError, match=r"tolerance must be at least .*: it would require more knots than the 60"):
+        cp.fit(times, values, continuity=4, tolerance=1e-2 * found, warn=False)
 
 
 def test_knots_are_few_where_few_suffice():
