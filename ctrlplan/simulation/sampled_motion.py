@@ -9,7 +9,6 @@ parts. Whatever the position of a breakpoint, each side is read where it is vali
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -229,13 +228,7 @@ class SampledMotion:
     @property
     def growth(self) -> float:
         """Growth of a perturbation of the states over the run, about."""
-        if not self._lines:
-            return growth(*self._steps)
-        matrices, kinds = self._steps
-        lines = [replace(line, initial=0.0 * line.initial, given=0.0 * line.given) for line in self._lines]
-        start = np.random.default_rng(0).standard_normal(matrices.shape[1])
-        free = marched_with_lines(np.asarray(start), matrices, kinds, np.zeros((kinds.size, start.size)), lines)
-        return float(np.abs(free).max(initial=0.0) / np.abs(start).max())
+        return growth(*self._steps, self._lines)
 
     def registers_at(self, times: Array) -> Array:
         """States (nz - nstates, ntime) of the registers."""
