@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,8 @@ _TOGETHER = 2**15
 _TABLE = 4_000_000
 """Maximum number of entries of the matrix of a part with delay lines."""
 
-_STEPS = 512
-"""Number of steps without a pattern from which growth is estimated."""
+_STEPS, _PASSES = 512, 4
+"""Minimum number of steps from which growth is estimated where there is no pattern, and that of passes of a line."""
 
 
 def repeated(state: Array, change: Array, forced: Array | None, count: int) -> Array:
@@ -125,6 +125,17 @@ class DelayLine:
     into: Array
 
     @property
+    def reach(self) -> int:
+        """Number of steps after which a value returns, at most about; 0 if none does."""
+        return int(np.diff(self.places[[0, self.count]])[0]) if self.places.size > self.count else 0
+
+    def unforced(self, nsteps: int) -> DelayLine:
+        """The same over the first steps, without what is added to the values, and from zero."""
+        count = int(np.searchsorted(self.places, nsteps, side="right"))
+        zero = np.zeros_like(self.given[:count])
+        return replace(self, places=self.places[:count], initial=0.0 * self.initial, given=zero, into=self.into[:count])
+
+    @property
     def at_start(self) -> bool:
         """Whether a value is taken from the first state."""
         return bool(self.places.size and self.places[0] == 0)
@@ -188,58 +199,100 @@ def _by_table(
     size: int,
     count: int,
 ) -> int:
-    """Compute `count` equal parts of `size` steps by one matrix from their first states and what returns."""
+    """Compute `count` equal parts of `size` steps: one matrix maps the start of a part to its end and what is taken.
+
+    The states inside of all parts follow together from their starts.
+    """
     n, last = found.shape[1], begin + size * count
-    own = matrices[kinds[begin : begin + size]]
-    inner = forced[begin:last].reshape(count, size, n).copy()
-    for j in range(1, size):
-        inner[:, j] += inner[:, j - 1] @ own[j].T
-    which = [line.between(begin, begin + size) for line in lines]
-    columns = np.cumsum([n, *(some.size * line.given.shape[1] for line, some in zip(lines, which, strict=True))])
-    known = np.eye(n, columns[-1])
-    table = np.empty((size, n, columns[-1]))
-    for j in range(size):
-        known = own[j] @ known
-        for line, some, column in zip(lines, which, columns, strict=False):
-            for k in np.flatnonzero(line.places[some] == begin + j + 1).tolist():
-                at = column + k * line.given.shape[1]
-                known[:, at : at + line.given.shape[1]] += line.into[some[k]]
-        table[j] = known
-    takes = [
-        (line.places[some] - 1 - begin, np.einsum("wn,knc->kwc", line.out, table[line.places[some] - 1 - begin]))
-        for line, some in zip(lines, which, strict=True)
-    ]
-    starts = np.empty((count, columns[-1]))
-    state = found[begin]
+    own, which = matrices[kinds[begin : begin + size]], [line.between(begin, begin + size) for line in lines]
+    given = forced[begin:last].reshape(count, size, n)
+    columns = np.cumsum(
+        [n, *(some.size * line.given.shape[1] for line, some in zip(lines, which, strict=True))]
+    ).tolist()
+    places = list(zip(lines, values, which, columns[:-1], columns[1:], strict=True))
+    whole, total = _lifted(own, given, lines, which, columns, begin)
+    state, starts = found[begin], np.empty((count, columns[-1]))
     for part in range(count):
         starts[part, :n] = state
-        for line, own_values, some, column in zip(lines, values, which, columns, strict=False):
-            back = line.returning(own_values, some + part * some.size)
-            starts[part, column : column + back.size] = back.ravel()
-        for line, own_values, some, (at, take) in zip(lines, values, which, takes, strict=True):
-            now = some + part * some.size
-            own_values[now] = take @ starts[part] + inner[part, at] @ line.out.T + line.given[now]
-        state = table[-1] @ starts[part] + inner[part, -1]
-    inner += (starts @ table.reshape(size * n, -1).T).reshape(count, size, n)
-    found[begin + 1 : last + 1] = inner.reshape(-1, n)
+        for line, earlier, some, column, end in places:
+            starts[part, column:end] = line.returning(earlier, some + part * some.size).ravel()
+        after = whole @ starts[part] + total[part]
+        state = after[:n]
+        for _, earlier, some, column, end in places:
+            earlier[some + part * some.size] = after[column:end].reshape(some.size, -1)
+    given = given.copy()
+    for line, _, some, column, end in places:
+        back = starts[:, column:end].reshape(count, some.size, -1, 1)
+        given[:, line.places[some] - 1 - begin] += np.matmul(line.into[some], back)[..., 0]
+    now, inside = starts[:, :n], found[begin + 1 : last + 1].reshape(count, size, n)
+    for j in range(size):
+        now = now @ own[j].T + given[:, j]
+        inside[:, j] = now
     return last
 
 
-def growth(matrices: Array, kinds: NDArray[np.intp]) -> float:
+def _lifted(
+    matrices: Array,
+    given: Array,
+    lines: Sequence[DelayLine],
+    which: Sequence[NDArray[np.intp]],
+    columns: Sequence[int],
+    begin: int,
+) -> tuple[Array, Array]:
+    """Matrix from a state and what returns in a part to the state after it and what is taken, and what is added.
+
+    Parameters
+    ----------
+    matrices, given : ndarray, shapes (size, n, n) and (count, size, n)
+        Steps of a part, and what is added after each step of all parts.
+    lines, which : sequences of DelayLine and of ndarray of int
+        Lines, and the numbers of their places in the first part.
+    columns : sequence of int
+        First column of what returns from each line.
+    begin : int
+        Step before the first part.
+
+    Returns
+    -------
+    (ndarray, ndarray), shapes (ncolumns, ncolumns) and (count, ncolumns)
+    """
+    count, size, n = given.shape
+    known, inner, parts = np.eye(n, columns[-1]), np.zeros((count, n)), np.arange(count)[:, None]
+    taken, added, due = list[Array](), list[Array](), list[dict[int, int]]()
+    for line, some in zip(lines, which, strict=True):
+        taken.append(np.empty((some.size, line.given.shape[1], columns[-1])))
+        added.append(line.given[some + some.size * parts])
+        due.append({step: k for k, step in enumerate((line.places[some] - 1 - begin).tolist())})
+    for j in range(size):
+        known, inner = matrices[j] @ known, inner @ matrices[j].T + given[:, j]
+        now = [(i, steps[j]) for i, steps in enumerate(due) if j in steps]
+        for i, k in now:
+            width = lines[i].given.shape[1]
+            known[:, columns[i] + k * width : columns[i] + (k + 1) * width] += lines[i].into[which[i][k]]
+        for i, k in now:
+            taken[i][k] = lines[i].out @ known
+            added[i][:, k] += inner @ lines[i].out.T
+    whole = np.concatenate([known, *(rows.reshape(-1, columns[-1]) for rows in taken)])
+    return whole, np.concatenate([inner, *(rows.reshape(count, -1) for rows in added)], axis=1)
+
+
+def growth(matrices: Array, kinds: NDArray[np.intp], lines: Sequence[DelayLine] = ()) -> float:
     """Growth of a perturbation of the states over the steps of given kinds, about; infinite if it overflows."""
     first, length = _pattern(kinds)
     n = matrices.shape[1]
     with np.errstate(all="ignore"):
-        if length:
+        if length and not lines:
             whole = np.eye(n)
             for kind in kinds[first : first + length].tolist():
                 whole = matrices[kind] @ whole
             found = np.linalg.matrix_power(whole, (kinds.size - first) // length)
             return float(np.nan_to_num(np.abs(found), nan=np.inf).max(initial=0.0))
-        some = kinds[-_STEPS:]
+        count = min(kinds.size, max([_STEPS, *(_PASSES * line.reach for line in lines)]))
+        some = kinds[:count] if lines else kinds[-count:]
         start = np.asarray(np.random.default_rng(0).standard_normal(n))
-        free = np.abs(_one_by_one(start, matrices, some, np.zeros((some.size, n))))
-        half = some.size // 2
+        zero = np.zeros((count, n))
+        free = np.abs(marched_with_lines(start, matrices, some, zero, [line.unforced(count) for line in lines]))
+        half = count // 2
         ratio = free[half:].max(initial=0.0) / max(float(free[: half + 1].max(initial=0.0)), 1e-300)
         return float(ratio ** (kinds.size / max(1, half)))
 

@@ -9,7 +9,6 @@ parts. Whatever the position of a breakpoint, each side is read where it is vali
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -209,7 +208,7 @@ class SampledMotion:
         """States (nz, ntime) at times [s] of the run, after the samples of those times."""
         spans, moving = self._spans, self.form.moving
         which = self._spans_at(times)
-        z: Array = np.take(self.states.T, spans.interval[which], axis=1)
+        z: Array = np.take(self.states, spans.interval[which], axis=0).T
         if not moving.size:
             return z
         since = times - spans.starts[which]
@@ -229,16 +228,12 @@ class SampledMotion:
     @property
     def growth(self) -> float:
         """Growth of a perturbation of the states over the run, about."""
-        if not self._lines:
-            return growth(*self._steps)
-        matrices, kinds = self._steps
-        lines = [replace(line, initial=0.0 * line.initial, given=0.0 * line.given) for line in self._lines]
-        start = np.random.default_rng(0).standard_normal(matrices.shape[1])
-        free = marched_with_lines(np.asarray(start), matrices, kinds, np.zeros((kinds.size, start.size)), lines)
-        return float(np.abs(free).max(initial=0.0) / np.abs(start).max())
+        return growth(*self._steps, self._lines)
 
     def registers_at(self, times: Array) -> Array:
         """States (nz - nstates, ntime) of the registers."""
+        if not self.form.registers.size:
+            return np.zeros((0, times.size))
         return np.take(self.states[:, self.form.nstates :].T, self._spans.interval[self._spans_at(times)], axis=1)
 
     def _spans_at(self, times: Array) -> NDArray[np.intp]:
@@ -580,11 +575,14 @@ def _largest(values: Array) -> Array:
 def _evaluated(series: Array, row: NDArray[np.intp], x: Array) -> Array:
     """Values (ntime, nx) of Chebyshev series (nspans, nterms, nx) in some rows at places from -1 to 1."""
     count, nx = series.shape[1:]
-    basis = np.empty((count, x.size))
-    basis[:1], basis[1:2] = 1.0, x
-    for j in range(2, count):
-        basis[j] = 2.0 * x * basis[j - 1] - basis[j - 2]
     found = np.empty((x.size, nx))
-    for own in np.array_split(np.arange(x.size), 1 + x.size // _TOGETHER):
-        np.einsum("tjn,jt->tn", series[row[own]], basis[:, own], out=found[own[0] : own[-1] + 1] if own.size else None)
+    for begin in range(0, x.size, _TOGETHER):
+        some = slice(begin, begin + _TOGETHER)
+        place = x[some]
+        basis = np.empty((count, place.size))
+        basis[:1], basis[1:2] = 1.0, place
+        for j in range(2, count):
+            np.multiply(2.0 * place, basis[j - 1], out=basis[j])
+            basis[j] -= basis[j - 2]
+        np.einsum("tjn,jt->tn", series[row[some]], basis, out=found[some])
     return found

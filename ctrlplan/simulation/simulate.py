@@ -243,8 +243,10 @@ def _response(job: Job, record: Record) -> SimulationResponse:
     """Response at the times of a job, up to the event that ends it."""
     prepared = job.prepared
     found = _occurrences(record)
-    places = np.searchsorted(record.times, job.times[job.times <= record.times[-1]])
-    times, states = record.times[places], record.states[:, places]
+    times, states = record.times, record.states
+    if times is not job.times:
+        places = np.searchsorted(times, job.times[job.times <= times[-1]])
+        times, states = times[places], states[:, places]
     last = next((occurrence.time for occurrence in found if occurrence.stop), None)
     if last is not None:
         end = record.state_at(int(np.searchsorted(record.times, last, side="right")) - 1, last)

@@ -68,3 +68,32 @@ def test_many_states_and_segments(states, segments, benchmark, capsys, monkeypat
             f"\n{states} states, {segments} segments: {1e3 * own:.1f} ms, peer {1e3 * other:.1f} ms, ratio "
             f"{ratio:.2f}; a tenth of it by segments {1e3 * before:.0f} ms, difference {error:.1e}"
         )
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("states", [4, 20, 100, 200])
+def test_samples_as_input(states, benchmark, capsys):
+    """Random samples connected by straight lines, as by the peer. Goal: at most 1."""
+    system = chain(states // 2)
+    ready, samples = cp.prepare(system), np.random.default_rng(0).standard_normal(T.size)
+
+    def ours():
+        return cp.simulate(ready, T, samples)
+
+    def peer():
+        return ct.forced_response(system, T, samples)
+
+    benchmark.pedantic(ours, rounds=3, warmup_rounds=1)
+    rows = []
+    for _ in range(2 * ROUNDS):
+        seconds, results = [], []
+        for function in (ours, peer):
+            begin = process_time()
+            results.append(function().outputs)
+            seconds.append(process_time() - begin)
+        rows.append(seconds)
+    own, other = (min(column) for column in zip(*rows, strict=True))
+    benchmark.extra_info["ratio"] = own / other
+    assert np.abs(results[0] - results[1]).max() <= 1e-11 * np.abs(results[1]).max()
+    with capsys.disabled():
+        print(f"\n{states} states, samples: {1e3 * own:.1f} ms, peer {1e3 * other:.1f} ms, ratio {own / other:.2f}")
