@@ -100,7 +100,7 @@ def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     attempt = Attempt(job, method, scales)
     attempt.go()
     for _ in range(PASSES - 1 if job.atol is None else 0):
-        found = scales.renewed(attempt.run.states, attempt.noise)
+        found = scales.renewed(attempt.run.states, attempt.noise, attempt.passed_on)
         if found is None:
             break
         following = Attempt(fresh, method, found)
@@ -337,6 +337,12 @@ class Attempt(Generic[S]):
         duration = float(self.run.times[-1] - self.run.times[0])
         shape = (len(x), -1)
         return duration * rounding_of(lambda near: self.on_trial(self.solver.rates, t, near, time_values, shape), x)
+
+    def passed_on(self, errors: Array) -> Array:
+        """Errors (nstates,) of the integrated states caused by errors of others."""
+        found = np.zeros(errors.size)
+        found[self.moving] = self.effects @ errors[self.moving]
+        return found
 
     def visited(self) -> tuple[Array, Array, Array]:
         """Some times and states of the run, and the values of the functions of time."""

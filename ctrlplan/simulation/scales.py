@@ -41,6 +41,9 @@ _OFFSET = 1e-2
 _NOISE = 1e11
 """Minimum scale of a state relative to the rounding errors of its derivative times the duration."""
 
+_PASSED_ON = 1e-3
+"""Minimum scale of a state relative to what the scales of others displace it by: their errors prevent smaller ones."""
+
 _ADDED = 0.3
 """Accumulated error of a state at the end of a run, relative to the tolerance of the run."""
 
@@ -101,7 +104,7 @@ class Scales:
         ones = np.ones(nstates)
         return cls(np.zeros(nstates), ones, RELATIVE if atol is None else atol, ones, np.zeros(nstates, dtype=bool))
 
-    def renewed(self, states: Array, noise: Callable[[], Array]) -> Scales | None:
+    def renewed(self, states: Array, noise: Callable[[], Array], passed_on: Callable[[Array], Array]) -> Scales | None:
         """Scales for the states of a run; None if the present ones are adequate.
 
         A state below the tolerances of two runs, although that of the second was set
@@ -114,6 +117,10 @@ class Scales:
         noise : callable
             Returns the rounding error of each derivative times the duration, shape
             (nstates,): a lower bound of the tolerances.
+        passed_on : callable
+            Maps errors of the states to those that they cause in others, shapes
+            (nstates,). A state that others hold at zero moves by their errors only,
+            which become smaller in each run.
         """
         moved = np.abs(states - states[:, :1]).max(axis=1, initial=0.0)
         size = np.abs(states).max(axis=1, initial=0.0)
@@ -123,8 +130,10 @@ class Scales:
         about = real & (moved < _OFFSET * size) & (self.shift == 0.0)
         if not (small | about).any():
             return None
-        floor = _NOISE * noise()
-        scale = np.where(small | about, np.maximum(moved, floor), self.scale)
+        found = np.maximum(moved, _NOISE * noise())
+        known = np.where(self.scale < 1.0, self.scale, np.minimum(moved, self.scale))  # of a run before, or of this one
+        others = _PASSED_ON * passed_on(np.where(small | about, found, known))
+        scale = np.where(small | about, np.maximum(found, others), self.scale)
         scale = np.where(scale > 0.0, scale, self.scale)
         shift = np.where(about, states[:, 0], self.shift)
         if np.all(scale >= _SMALL * self.scale) and np.array_equal(shift, self.shift):

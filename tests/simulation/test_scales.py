@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import ctrlplan as cp
-from ctrlplan.simulation.scales import effects
+from ctrlplan.simulation.scales import Scales, effects
 
 METHODS = ["compiled", "python"]
 ALLOWED = 1e-6
@@ -322,3 +322,19 @@ def calls_of_a_car_with_a_noisy_signal(size):
 def test_a_large_state_that_nothing_depends_on_is_not_integrated_more_closely():
     small, large = (calls_of_a_car_with_a_noisy_signal(size) for size in (1.0, 1e8))
     assert large < 2 * small
+
+
+def test_a_state_held_at_zero_by_others_has_no_smaller_scale_than_their_errors():
+    """x0 = 10 rounds to 1e-15 and feeds x1 with slope 2: x1 is rounding, and its scale does not follow it to zero."""
+    noise, eps = np.array([1e-14, 0.0]), 1e-15
+    scales = Scales.plain(2, None)
+    for size in (1e-15, 1e-19, 1e-24):
+        states = np.array([[10.0, 10.0 + eps, 10.0], [0.0, size, -size]])
+        found = scales.renewed(states, lambda: noise, lambda errors: np.array([0.0, 2.0 * errors[0]]))
+        scales = scales if found is None else found
+        assert scales.scale[0] == pytest.approx(1e-3)  # 1e11 times the noise
+        assert scales.scale[1] == pytest.approx(2e-6)  # a thousandth of what that displaces it by
+    # A small motion of its own, which no other state feeds, is resolved.
+    states = np.array([[10.0, 10.0 + eps, 10.0], [0.0, 1e-19, -1e-19]])
+    found = Scales.plain(2, None).renewed(states, lambda: noise, np.zeros_like)
+    assert found.scale[1] == pytest.approx(1e-19)
