@@ -454,7 +454,13 @@ class PiecewiseSpline(WaypointSpline):
         times = self.breakpoints
         first, last = float(t.min()), float(t.max())
         if not (first > times[0] if left else first >= times[0]) or not last <= times[-1]:
-            return super()._sample(t, low, high, left)
+            inside = (t > times[0] if left else t >= times[0]) & (t <= times[-1])
+            if np.count_nonzero(inside) <= _FEW:
+                return super()._sample(t, low, high, left)
+            out = np.empty((high - low + 1, self.naxes, t.size))
+            out[:, :, inside] = self._sample(t[inside], low, high, left)
+            out[:, :, ~inside] = super()._sample(t[~inside], low, high, left)
+            return out
         with np.errstate(over="ignore", invalid="ignore"):
             out = self._sample_inside(t, low, high, left, (first, last))
         return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
