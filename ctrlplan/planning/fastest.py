@@ -231,7 +231,7 @@ def fastest(
         Values or ranges of parameters of `system`, as for `margins`: limits are
         satisfied for the worst ones.
     ends : {"free", "given"}, optional
-        With hold="path", and limits that depend on at most four derivatives: speeds
+        With hold="path", and limits that depend on at most five derivatives: speeds
         where the plan starts or ends in motion, free, or those of the given plan.
     quantities : optional
         Deprecated name of `system`.
@@ -251,7 +251,7 @@ def fastest(
         shaped (`Shaper`), since another duration would change the delays. If limits
         of a loop are violated in its steady state. If `hold` is "path" and the plan
         jumps, limits are not local in time, or do not bound the speed; or if a
-        limit depends on derivatives of order 5 or higher and the plan is closed and in
+        limit depends on derivatives of order 6 or higher and the plan is closed and in
         motion at its ends.
     RuntimeError
         If a quantity is not resolved because it is noisy or oscillates.
@@ -302,10 +302,10 @@ def fastest(
     limits of the second kind.
 
     With fixed path and other limits (quantities, derivatives of order 4, accelerations
-    of one sign) that depend on at most four derivatives of the plan, the quartic spline is found by a sequence of
+    of one sign) that depend on at most five derivatives of the plan, the quartic spline is found by a sequence of
     linearised problems: a local minimum. For a crane it was within 0.3 % of the
     solution of the nonlinear program on a fine grid. The law has four continuous
-    derivatives between stops. With limits that depend on higher derivatives the rate
+    derivatives between stops. With limits that depend on a sixth one or higher the rate
     is a spline with 16 knots in the time of the given plan, and the duration depends
     on the timing of that plan.
 
@@ -473,7 +473,9 @@ def _fastest_between_stops(plan: PathPlan, limited: Limited, span: tuple[float, 
         if orders is not None:
             laws.append(fastest_segment_law(part, own, orders))
         else:
-            laws.append(Retimed(part.laws[0], with_fast_time_law(own.seen(part), own).law))
+            seen = own.seen(part)
+            fast_part = fast_law_of_signals(seen, own, 0.0) if own.order <= HIGHEST else with_fast_time_law(seen, own)
+            laws.append(part.laws[0] if fast_part is None else Retimed(part.laws[0], fast_part.law))
     fast = plan.with_laws(laws).shift(plan.start - laws[0].start)
     if orders is None:
         return replace(fastest_within(fast, limited, span), hold="path")

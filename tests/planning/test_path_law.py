@@ -468,7 +468,7 @@ def test_speeds_that_are_infeasible(plan, limits, message):
         ({"ends": "fixed"}, "ends must be one of free, given, got 'fixed'"),
         ({"ends": "given", "hold": "shape"}, 'ends must be "free" unless hold is "path"'),
         ({"ends": "given", "durations": (1.0, 9.0)}, 'durations must not be given with ends="given"'),
-        ({"ends": "given", "limits": {"y_d1": 2.0, "y_d5": 1.0}}, 'ends must be "free" with limits that depend on'),
+        ({"ends": "given", "limits": {"y_d1": 2.0, "y_d6": 1.0}}, 'ends must be "free" with limits that depend on'),
     ],
 )
 def test_ends_that_do_not_apply(options, message):

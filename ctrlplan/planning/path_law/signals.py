@@ -2,7 +2,7 @@
 
 Signals are functions of the derivatives of the plan in time, and these of b and its
 derivatives by the path parameter: s'^2 = b, s'' = b'/2, s''' = b'' s'/2,
-s'''' = (b''' b + b'' b'/2)/2. They are linearised about the last solution, within a trust
+s'''' = (b''' b + b'' b'/2)/2, and so on. They are linearised about the last solution, within a trust
 region; of each solution the largest multiple is taken that satisfies the limits at
 points of all cells.
 """
@@ -76,8 +76,8 @@ _SCALE, _BEYOND = 1e-4, 10.0
 _FAR = 1e6
 """Magnitude of a missing limit, in the scale of the other one."""
 
-HIGHEST = 4
-"""Highest derivative of the plan on which signals may depend: the law has four continuous ones."""
+HIGHEST = 5
+"""Highest derivative of the plan on which signals may depend: the law has four continuous ones, the fifth jumps."""
 
 
 def fast_law_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Trajectory | None:
@@ -310,9 +310,15 @@ class _Signals:
     def _values(self, derivatives: Array) -> Array:
         """Signals (nbounds, ..., npoints) in the scale of their limits, by derivatives (order, ..., npoints) of b."""
         shape = derivatives.shape[1:]
-        b, slope, bend, third = np.concatenate([derivatives, np.zeros((4 - self._order, *shape))])
+        b, slope, bend, third, fourth = np.concatenate([derivatives, np.zeros((HIGHEST - self._order, *shape))])
         rate = np.sqrt(np.maximum(b, 1e-300))
-        series = [rate, slope / 4.0, bend * rate / 12.0, (third * b + 0.5 * bend * slope) / 48.0][: self._order]
+        series = [
+            rate,
+            slope / 4.0,
+            bend * rate / 12.0,
+            (third * b + 0.5 * bend * slope) / 48.0,
+            (fourth * b + 1.5 * third * slope + 0.5 * bend**2) * rate / 240.0,
+        ][: self._order]
         path = [row.reshape(len(row), *np.ones(len(shape) - 1, dtype=int), -1) for row in self._path]
         rows = [np.broadcast_to(row, (len(row), *shape)) for row in composed(path, series)]
         jet = np.stack(rows).reshape(len(rows), len(path[0]), -1) * FACTORIALS[: self._order + 1, None, None]
