@@ -101,7 +101,8 @@ class PlansByDuration:
         samples = []
         for part in self._parts:
             t = part.plan.start + fraction * part.plan.duration
-            jet = np.stack([part.plan.jet(t, self.limited.order, left) for left in (False, True)], axis=-1)
+            seen = self.limited.seen(part.plan)
+            jet = np.stack([seen.jet(t, self.limited.order, left) for left in (False, True)], axis=-1)
             samples.append(Sampled(jet, np.full(2, fraction), np.full(2, 0.5), part.plan.duration))
         return lambda duration: float(self._excesses(samples, np.array([duration]), [bound])[0])
 

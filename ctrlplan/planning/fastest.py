@@ -231,8 +231,8 @@ def fastest(
         Values or ranges of parameters of `system`, as for `margins`: limits are
         satisfied for the worst ones.
     ends : {"free", "given"}, optional
-        With hold="path" and limits of velocities and accelerations: speeds where the
-        plan starts or ends in motion, free, or those of the given plan.
+        With hold="path", and limits that depend on at most five derivatives: speeds
+        where the plan starts or ends in motion, free, or those of the given plan.
     quantities : optional
         Deprecated name of `system`.
 
@@ -251,7 +251,7 @@ def fastest(
         shaped (`Shaper`), since another duration would change the delays. If limits
         of a loop are violated in its steady state. If `hold` is "path" and the plan
         jumps, limits are not local in time, or do not bound the speed; or if a
-        limit depends on derivatives of order 5 or higher and the plan is closed and in
+        limit depends on derivatives of order 6 or higher and the plan is closed and in
         motion at its ends.
     RuntimeError
         If a quantity is not resolved because it is noisy or oscillates.
@@ -301,11 +301,11 @@ def fastest(
     b, so that the time laws are the fastest ones up to the same 0.3 %, or 0.5 % without
     limits of the second kind.
 
-    With fixed path and other limits (quantities, derivatives of order 4) that depend on
-    at most four derivatives of the plan, the quartic spline is found by a sequence of
+    With fixed path and other limits (quantities, derivatives of order 4, accelerations
+    of one sign) that depend on at most five derivatives of the plan, the quartic spline is found by a sequence of
     linearised problems: a local minimum. For a crane it was within 0.3 % of the
     solution of the nonlinear program on a fine grid. The law has four continuous
-    derivatives between stops. With limits that depend on higher derivatives the rate
+    derivatives between stops. With limits that depend on a sixth one or higher the rate
     is a spline with 16 knots in the time of the given plan, and the duration depends
     on the timing of that plan.
 
@@ -385,7 +385,8 @@ def _fastest(
         return _searched(ReplannedPlans(plan, limited), span, hold, endless=False)
     if hold == "path":
         stops = isinstance(plan, PathPlan)  # at rest at its ends as well
-        if not stops and limited.derivatives_only and limited.order <= 3:
+        signed = any(_is_signed(bound) for bound in limited.bounds)
+        if not (stops or signed) and limited.derivatives_only and limited.order <= 3:
             return _fastest_on_path(plan, limited, span, ends)
         limited.check_constant('limits with hold="path"')
         limited.check_smooth(plan)
@@ -401,11 +402,17 @@ def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, f
     start, law = plan.start, None
     if limited.order <= HIGHEST:
         _check_rest(plan, limited)
-        _closed_form(plan, limited)  # raises for a sign that is infeasible at every duration
+        _check_signs(plan, limited, given=False)
+        _closed_form(plan, limited, 1)  # raises for a direction in which no velocity is allowed
         law = fast_law_of_signals(plan.shift(-start), limited, start)
         found = None if law is None or span is not None else _at_its_limit(law.shift(start), limited)
         if found is not None:
             return found
+        if any(_is_signed(bound) for bound in limited.bounds):
+            raise ValueError(
+                "limits that forbid a sign must be satisfied by a time law on the path, got none that is found; give a "
+                "small limit instead of 0"
+            )
     else:
         _check_open(plan)
     uniform = fastest_within(plan, limited, span)
@@ -423,6 +430,7 @@ def _with_given_speeds(plan: Trajectory, limited: Limited, span: tuple[float, fl
             f'"given" with those of order {limited.order}; limit lower derivatives, or use hold="waypoints"'
         )
     _check_rest(plan, limited)
+    _check_signs(plan, limited, given=True)
     found, margins = _with_reserves(
         plan, limited, span, partial(law_with_given_ends, plan.shift(-plan.start), limited, plan.start)
     )
@@ -465,7 +473,9 @@ def _fastest_between_stops(plan: PathPlan, limited: Limited, span: tuple[float, 
         if orders is not None:
             laws.append(fastest_segment_law(part, own, orders))
         else:
-            laws.append(Retimed(part.laws[0], with_fast_time_law(own.seen(part), own).law))
+            seen = own.seen(part)
+            fast_part = fast_law_of_signals(seen, own, 0.0) if own.order <= HIGHEST else with_fast_time_law(seen, own)
+            laws.append(part.laws[0] if fast_part is None else Retimed(part.laws[0], fast_part.law))
     fast = plan.with_laws(laws).shift(plan.start - laws[0].start)
     if orders is None:
         return replace(fastest_within(fast, limited, span), hold="path")
@@ -533,12 +543,6 @@ def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, floa
         limited.check_smooth(plan)
     if not limited.order:
         raise ValueError("limits must include one that a shorter plan would violate, got none")
-    for bound in limited.bounds:
-        if bound.order > 1 and 0.0 in (bound.low, bound.high):
-            raise ValueError(
-                f'limits of {bound.name} must allow both signs with hold="path", got {bound.range}; give a small limit '
-                'instead of 0, or use hold="shape"'
-            )
     _check_rest(plan, limited)
     _closed_form(plan, limited)  # raises for a direction in which no velocity is allowed
     on_path = limited if limited.is_constant else limited.at_positions()
@@ -615,9 +619,9 @@ def _check_given_speeds(plan: Trajectory, limited: Limited) -> None:
             low, high = (float(side[0]) for side in bound.sides(np.array([time])))
             if bound.order <= 1 and max(low - value, value - high) > 1e-9 * bound.scale:
                 raise ValueError(
-                    f"limits must be satisfied with the speeds at the ends, got {bound.name} = {value:.6g} at {time:g} s "
-                    f"where it must be from {low:.6g} to {high:.6g}; raise this limit, lower the speed, or choose free "
-                    "ends"
+                    f"limits must be satisfied with the speeds at the ends, got {bound.name} = {value:.6g} at {time:g} "
+                    f"s where it must be from {low:.6g} to {high:.6g}; raise this limit, lower the speed, or choose "
+                    "free ends"
                 )
 
 
@@ -629,6 +633,40 @@ def _law_on_path(plan: Trajectory, limited: Limited, given: Rates = (None, None)
     else:
         found = fastest_law(begun, limited.bounds, plan.start, given, reserve)
     return replace(found, plan=found.plan.shift(plan.start)) if plan.start else found
+
+
+def _check_signs(plan: Trajectory, limited: Limited, given: bool) -> None:
+    """Raise for accelerations of one sign where every time law has the other one."""
+    for bound in (own for own in limited.bounds if _is_signed(own) and own.order == 2):
+        forbidden = 1.0 if bound.high == 0.0 else -1.0
+        times, velocities = _velocities(plan, bound.axis or 0)
+        still = np.flatnonzero(velocities == 0.0)
+        # From rest in a direction with an acceleration in it, to rest with one against it.
+        wrong = [k for k in still if (forbidden * np.append(velocities[k:], -velocities[:k]) > 0.0).any()]
+        change = forbidden * float(np.diff(velocities[[0, -1]])[0])
+        if wrong or (given and change > 0.0):
+            where = f"is at rest at {times[wrong[0]]:.6g} s" if wrong else "changes its speed from the start to the end"
+            raise ValueError(
+                f'limits of {bound.name} must allow both signs with hold="path", got {bound.range}: every time law has '
+                f"the other one, since {plan.labels[bound.axis or 0]} {where} of the plan; give a small limit "
+                "instead of 0"
+            )
+
+
+def _is_signed(bound: Bound) -> bool:
+    """Whether a limit of a higher derivative of an axis forbids a sign."""
+    return bound.axis is not None and bound.order > 1 and 0.0 in (bound.low, bound.high)
+
+
+def _velocities(plan: Trajectory, axis: int) -> tuple[Array, Array]:
+    """Times [s] and velocities of an axis at samples, those of rest 0, and at changes of the direction between."""
+    inside = plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * np.linspace(0.0, 1.0, 65)[1:-1]
+    times = np.unique(np.concatenate([plan.breakpoints, inside.ravel(), [point.time for point in plan.waypoints]]))
+    velocities = plan.jet(times, 1, left=True)[1, axis]
+    velocities[0] = plan.jet(times[0], 1)[1, axis]
+    velocities[np.abs(velocities) <= 1e-9 * np.abs(velocities).max()] = 0.0
+    turns = 1 + np.flatnonzero(velocities[1:] * velocities[:-1] < 0.0)
+    return np.insert(times, turns, times[turns]), np.insert(velocities, turns, 0.0)
 
 
 def _is_over_time(bound: Bound) -> bool:
@@ -765,11 +803,11 @@ def _check_rest(plan: Trajectory, limited: Limited) -> None:
         )
 
 
-def _closed_form(plan: Trajectory, limited: Limited) -> float:
-    """Minimum duration for limits of derivatives, T_0 max_k (peak_k/limit_k)^(1/k)."""
+def _closed_form(plan: Trajectory, limited: Limited, highest: float = math.inf) -> float:
+    """Minimum duration for limits of derivatives up to an order, T_0 max_k (peak_k/limit_k)^(1/k)."""
     minimum, seen = 0.0, limited.seen(plan)
     for bound in limited.bounds:
-        if bound.axis is not None and bound.order and bound.is_constant:
+        if bound.axis is not None and 0 < bound.order <= highest and bound.is_constant:
             extrema = seen.extrema(bound.order)
             sides = (
                 (float(extrema.maximum[bound.axis]), bound.high, float(extrema.time_max[bound.axis])),

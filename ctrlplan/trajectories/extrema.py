@@ -291,7 +291,7 @@ class _Search:
         self._plan, self._function, self._order, self._scale = plan, function, order, scale
         self._starts, self._durations = _searchable_segments(plan)
         self._spent = 0
-        self._low, self._high = np.inf, -np.inf
+        self._low, self._high = np.array(np.inf), np.array(-np.inf)
         self._best: dict[tuple[int, float], tuple[int, float, float]] = {}  # segment, time and value by row and sign
         shares = np.maximum(self._durations / plan.duration, 1.0 / self._durations.size)
         counts = 2 ** np.ceil(np.log2(np.maximum(_SAMPLES * shares, 64.0))).astype(int)
@@ -543,7 +543,7 @@ class _Candidates:
         self.values: list[Array] = []
         self.ends: list[Array] = []
 
-    def add(self, t: Array, values: Array, ends: tuple[float, float] = (np.nan, np.nan)) -> None:
+    def add(self, t: Array, values: Array, ends: tuple[float, float] | tuple[Array, Array] = (np.nan, np.nan)) -> None:
         """Add values (naxes, ntime); the `ends` of a segment take precedence in a tie."""
         self.times.append(t)
         self.values.append(values)

@@ -468,7 +468,7 @@ def test_speeds_that_are_infeasible(plan, limits, message):
         ({"ends": "fixed"}, "ends must be one of free, given, got 'fixed'"),
         ({"ends": "given", "hold": "shape"}, 'ends must be "free" unless hold is "path"'),
         ({"ends": "given", "durations": (1.0, 9.0)}, 'durations must not be given with ends="given"'),
-        ({"ends": "given", "limits": {"y_d1": 2.0, "y_d5": 1.0}}, 'ends must be "free" with limits that depend on'),
+        ({"ends": "given", "limits": {"y_d1": 2.0, "y_d6": 1.0}}, 'ends must be "free" with limits that depend on'),
     ],
 )
 def test_ends_that_do_not_apply(options, message):
@@ -488,3 +488,55 @@ def test_a_path_with_stops_between_its_segments():
     assert 6.0 <= found.duration <= 6.0 * 1.003
     assert found.plan.stops[1] - found.plan.stops[0] == pytest.approx(4.0, rel=0.003)
     assert found.margins.satisfied
+
+
+# Accelerations of one sign
+
+LAUNCH = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 1, 0)])
+FASTER = PolySpline([Waypoint(0, 0, 0.5, 0), Waypoint(1, 1, 1, 0)])
+
+
+@pytest.mark.parametrize(
+    ("plan", "limits", "ends", "best"),
+    [
+        (LAUNCH, {"y_d1": 2.0, "y_d2": (0.0, 1.0)}, "free", math.sqrt(2.0)),  # 1 = T^2/2
+        (LAUNCH, {"y_d1": 2.0, "y_d2": (0.0, 1.0)}, "given", 1.5),  # to 1 m/s in 1 s over 0.5 m, and on
+        (FASTER, {"y_d1": 2.0, "y_d2": (0.0, 1.0)}, "given", 1.125),  # to 1 m/s in 0.5 s over 0.375 m, and on
+        (FASTER, {"y_d1": 2.0, "y_d2": (-1.0, 0.0), "y_d3": 10.0}, "free", 0.5),  # 2 m/s all the way
+    ],
+)
+def test_accelerations_of_one_sign(plan, limits, ends, best):
+    found = fastest(plan, limits, hold="path", ends=ends)
+    assert best * (1 - 1e-9) <= found.duration <= 1.002 * best
+    assert found.margins.satisfied
+    acceleration = found.plan(np.linspace(found.plan.start, found.plan.end, COUNT), 2)
+    low, high = limits["y_d2"]
+    assert low - 1e-12 <= acceleration.min() <= acceleration.max() <= high + 1e-12
+    if ends == "given":
+        assert found.plan.jet(found.plan.end, 1, left=True)[1, 0] == pytest.approx(1.0, rel=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("plan", "limit", "ends", "message"),
+    [
+        (MOVE, (0.0, 1.0), "free", "since y is at rest at 1 s"),
+        (MOVE, (-1.0, 0.0), "free", "since y is at rest at 0 s"),
+        (LAUNCH, (-1.0, 0.0), "free", "since y is at rest at 0 s"),
+        (FASTER, (-1.0, 0.0), "given", "since y changes its speed from the start to the end"),
+    ],
+)
+def test_a_sign_of_the_acceleration_that_every_law_has(plan, limit, ends, message):
+    with pytest.raises(ValueError, match=f'limits of y_d2 must allow both signs with hold="path".*{message}'):
+        fastest(plan, {"y_d1": 2.0, "y_d2": limit}, hold="path", ends=ends)
+
+
+def test_axes_with_times_that_differ_by_rounding():
+    """Segments between such times are no part of the path, wherever the plan starts."""
+    one = random_path(4, 1, 5)
+    best = fastest(one, LIMITS, hold="path").duration
+    for start in (0.0, 1e5):
+        first = one.shift(start)
+        second = first.shift(4 * np.spacing(start + 1.0))
+        plan = cp.stack([cp.Clipped(own, second.start, first.end) for own in (first, second)], labels=["a", "b"])
+        assert np.diff(plan.breakpoints).min() < 1e-9
+        assert fastest(plan, LIMITS, hold="path").duration == pytest.approx(best, rel=1e-4)

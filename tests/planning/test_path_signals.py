@@ -100,3 +100,16 @@ def test_a_closed_plan_stays_closed():
     t = np.linspace(cycle.start, cycle.end, 200_001)
     length = np.hypot(*cycle(t, 1)).mean() * cycle.duration
     assert length / 2.0 * (1 - 1e-6) <= found.duration <= length / 2.0 * 1.006
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [4, 5])
+def test_a_higher_derivative_alone_in_closed_form(order):
+    """1 m from rest to rest with abs(y^(k)) <= M: 1 = M T^k 2^(2 - 2 k)/(k - 1)!, by polynomials of minimum L1 norm."""
+    rest = [0.0] * order
+    move = PolySpline([Waypoint.from_jets(0, y=[0.0, *rest]), Waypoint.from_jets(1, y=[1.0, *rest])])
+    found = fastest(move, {f"y_d{order}": 1e3}, hold="path")
+    best = (2.0 ** (2 * order - 2) * math.factorial(order - 1) / 1e3) ** (1 / order)
+    assert best * (1 - 1e-9) <= found.duration <= 1.011 * best
+    assert np.abs(found.plan(np.linspace(found.plan.start, found.plan.end, 20_001), order)).max() <= 1e3 * (1 + 1e-9)
+    assert found.margins.satisfied

@@ -72,8 +72,9 @@ class Problem:
     def feasible_scale(self, x: Array) -> float:
         """Largest factor of coefficients for which the inequalities hold."""
         values = _applied(self.rows, x[self.spline.index])
-        below = values[: len(self.lower)] / self.lower
-        return 1.0 / max(float((values / self.upper).max()), float(below.max(initial=0.0)))
+        pairs = ((values, self.upper, self.upper > 0.0), (values[: len(self.lower)], self.lower, self.lower < 0.0))
+        shares = [float((own[chosen] / side[chosen]).max(initial=0.0)) for own, side, chosen in pairs]
+        return 1.0 / max(shares)
 
 
 def minimum(problem: Problem, start: Array) -> Array:
@@ -178,8 +179,9 @@ class _Search:
         return np.concatenate([(self._upper - values).ravel(), below.ravel(), *ends])
 
     def _sizes(self) -> Array:
-        """Magnitudes of all limits, in the order of the slacks."""
-        return np.concatenate([self._upper.ravel(), -self._lower.ravel(), np.ones(2 * self._size)])
+        """Magnitudes of all limits, 1 for those that forbid a sign, in the order of the slacks."""
+        sides = (self._upper.ravel(), -self._lower.ravel())
+        return np.concatenate([*(np.where(side > 0.0, side, 1.0) for side in sides), np.ones(2 * self._size)])
 
     def _changes(self, dx: Array) -> Array:
         """Changes of the slacks with coefficients."""

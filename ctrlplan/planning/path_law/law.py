@@ -80,7 +80,7 @@ def fastest_law(
         spline, activity = Spline.of(grid), Activity.of(grid, bounds, POINTS, start)
         rows = activity.rows(grid.length).with_reserve(POINTS.size, reserve, *grid.ends(moving=True))
         problem = problem_of(grid, spline, rows)
-        x = swept(grid, spline, rows)
+        x = swept(grid, spline, rows.relaxed())
         scale = _START if any(given) else _START * problem.feasible_scale(x)
         x = minimum(problem, np.where(spline.fixed, x, scale * x))
         local = spline.coefficients(x)

@@ -20,6 +20,9 @@ POINTS = readonly(np.array([0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0]))
 SMOOTH_POINTS = readonly(0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 6)))
 """The same with limits of the jerk, which vanishes at points of rest."""
 
+_RELAXED = 0.05
+"""Distance of limits from 0 with which a first law is found where they forbid a sign, relative to half their range."""
+
 _FAR = 1e4
 """Magnitude of a missing limit, relative to that on the other side."""
 
@@ -33,9 +36,9 @@ class Rows:
     factors : ndarray, shape (nrows, ncells, degree + 1)
         Of the Bernstein coefficients of a cell.
     upper : ndarray, shape (nrows, ncells)
-        Upper limits, above 0.
+        Upper limits, above 0, or 0 for one that forbids a sign.
     lower : ndarray, shape (ntwo, ncells)
-        Lower limits, below 0, of the first rows.
+        Lower limits of the first rows, below 0, or 0.
     """
 
     factors: Array
@@ -49,6 +52,14 @@ class Rows:
         upper = (1.0 - reserve) * self.upper
         upper[-npoints, first] = upper[-1, last] = _FAR
         return Rows(self.factors, upper, (1.0 - reserve) * self.lower)
+
+    def relaxed(self) -> Rows:
+        """Rows whose limits include 0 with a distance."""
+        upper, lower = (
+            np.where(self.upper > 0.0, self.upper, _RELAXED),
+            np.where(self.lower < 0.0, self.lower, -_RELAXED),
+        )
+        return Rows(self.factors, upper, lower)
 
 
 @dataclass(frozen=True)
@@ -91,7 +102,7 @@ class Activity:
                 # A limit of 0 applies to a direction in which the plan does not move, up to rounding.
                 speeds = np.maximum(speeds, np.where(np.isfinite(share), share, 0.0) ** 2)
             elif bound.order == 2:
-                low, high = np.maximum(low, -_FAR * high), np.minimum(high, -_FAR * low)
+                low, high = np.where(np.isinf(low), -_FAR * high, low), np.where(np.isinf(high), -_FAR * low, high)
                 half = 0.5 * (high - low)
                 applies = np.isfinite(half)  # otherwise infinite on both sides
                 mean = 0.5 * np.add(low, high, out=np.zeros_like(half), where=applies)
@@ -154,7 +165,8 @@ class Activity:
         found = np.sqrt(np.maximum(self.speeds * b, 0.0))
         for tangent, curvature, centre in zip(self.tangent, self.curvature, self.centre, strict=True):
             value = tangent * 0.5 * slope + curvature * b
-            found = np.maximum(found, np.maximum(value / (1.0 + centre), value / (centre - 1.0)))
+            for side in (1.0 + centre, centre - 1.0):
+                found = np.maximum(found, np.divide(value, side, out=np.zeros_like(value), where=side != 0.0))
         bend = bernstein(points, degree, 2) @ local / length**2
         for first, second, third in self.jerks:
             found = np.maximum(found, (third * b + 1.5 * second * slope + 0.5 * first * bend) * np.sqrt(b))

@@ -2,13 +2,14 @@
 
 Signals are functions of the derivatives of the plan in time, and these of b and its
 derivatives by the path parameter: s'^2 = b, s'' = b'/2, s''' = b'' s'/2,
-s'''' = (b''' b + b'' b'/2)/2. They are linearised about the last solution, within a trust
+s'''' = (b''' b + b'' b'/2)/2, and so on. They are linearised about the last solution, within a trust
 region; of each solution the largest multiple is taken that satisfies the limits at
 points of all cells.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -38,6 +39,9 @@ _ROUNDS, _GAIN = 30, 5e-4
 
 _NEAR, _WORSE = 0.5, 0.05
 """Solutions are linearised about that need to be slowed down in b, or in their duration, by no more than that."""
+
+_FARTHEST = 1e4
+"""Largest trust region, in which a first solution is found for a plan that violates the limits."""
 
 _SETTLED = 1.2
 """Trust region with which a solution that does not change is a local minimum."""
@@ -72,8 +76,8 @@ _SCALE, _BEYOND = 1e-4, 10.0
 _FAR = 1e6
 """Magnitude of a missing limit, in the scale of the other one."""
 
-HIGHEST = 4
-"""Highest derivative of the plan on which signals may depend: the law has four continuous ones."""
+HIGHEST = 5
+"""Highest derivative of the plan on which signals may depend: the law has four continuous ones, the fifth jumps."""
 
 
 def fast_law_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Trajectory | None:
@@ -98,8 +102,9 @@ def fast_law_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Tr
     scale = problems.feasible_scale()
     if not 0.0 < scale < 1.0 / _SLOWEST:
         return None
-    law = problems.law(_START * scale, _RESERVE, _BETWEEN)
-    return Retimed(plan, law) if law.duration < (1.0 - _RESERVE) * plan.duration / scale**0.5 else None
+    law = problems.law(_START * scale, _RESERVE, 0.0 if problems.signed else _BETWEEN)
+    faster = law.duration < (1.0 - _RESERVE) * plan.duration / scale**0.5
+    return Retimed(plan, law) if faster or problems.signed else None
 
 
 def law_with_given_ends(plan: Trajectory, limited: Limited, origin: float, reserve: float) -> Trajectory:
@@ -123,6 +128,11 @@ class _Problems:
         self._grid = Grid.of(plan, [part for part in self._parts if part.moves])
         self._spline = Spline.quartic(self._grid)
         self._signals, self._between = (_Signals(self._grid, limited, points) for points in (_POINTS, _CHECKS))
+
+    @property
+    def signed(self) -> bool:
+        """Whether a limit forbids a sign of a derivative."""
+        return bool(self._signals.strict.any())
 
     def feasible_scale(self) -> float:
         """Largest squared rate, the same along the plan, that satisfies the limits at the points."""
@@ -160,8 +170,8 @@ class _Problems:
                 problem = replace(problem_of(self._grid, self._spline, rows), trust=trust)
                 tried = minimum(problem, x)
             except ValueError:  # the linearised limits cannot be satisfied near this solution
-                x, trust = best, trust**0.4
-                if trust < 1.001:
+                x, trust = best, trust**0.4 if math.isfinite(duration) else 4.0 * trust
+                if not 1.001 < trust < _FARTHEST:
                     break
                 continue
             scale, feasible = self._slowed(tried)
@@ -178,11 +188,11 @@ class _Problems:
     def _slowed(self, x: Array) -> tuple[float, Array]:
         """Factor of a squared rate with which it satisfies the limits, and the product.
 
-        With given rates at the ends there is no such factor; that of the duration is a
-        penalty.
+        With given rates at the ends, and with limits that forbid a sign, there is no such
+        factor; that of the duration is a penalty.
         """
         local = self._spline.coefficients(x)
-        if self._spline.fixed.any():
+        if self._spline.fixed.any() or self._signals.strict.any():
             return (1.0 + _PENALTY * max(self._signals.beyond(local), 0.0)) ** -2.0, x
         scale = self._signals.feasible_scale(local)
         return scale, scale * x
@@ -201,12 +211,26 @@ class _Signals:
         self._moving = [k for k, bound in enumerate(limited.bounds) if bound.axis is None or bound.order > 0]
         bounds = [limited.bounds[k] for k in self._moving]
         self._scales = np.array([bound.scale for bound in bounds])[:, None]
-        # A limit that is attained at rest has no reserve there.
+        # A limit that is attained at rest has no reserve there; of a derivative, one that increases from there.
+        strict = np.array([bound.axis is not None and bound.slack > 0.0 for bound in bounds])[:, None]
         slack = np.array([bound.slack + 2.0 * _RESERVE if bound.slack else 0.0 for bound in bounds])[:, None]
+        slack = np.where(strict, np.where(self._at_rest(), _FAR, 0.0), slack)
         low, high = (np.array([[getattr(bound, side)] for bound in bounds]) for side in ("low", "high"))
+        ramp = (grid.length / grid.length.max()).repeat(points.size)
+        self._low_share, self._high_share = (np.where(strict & (side == 0.0), ramp, 1.0) for side in (low, high))
+        self.strict = strict
         speeds = np.array([bound.order <= 1 for bound in bounds])[:, None] & self._at_given_speeds()
         self._low = np.where(speeds, -_FAR, np.maximum(low / self._scales, -_FAR) - slack)
         self._high = np.where(speeds, _FAR, np.minimum(high / self._scales, _FAR) + slack)
+
+    def _at_rest(self) -> NDArray[np.bool_]:
+        """Points (npoints,) at which the plan is at rest."""
+        found = np.zeros((self._grid.length.size, self._points.size), dtype=bool)
+        firsts = np.flatnonzero(np.diff(self._grid.part, prepend=-1))
+        for part, begin, end in zip(self._grid.parts, firsts, [*firsts[1:], len(found)], strict=True):
+            found[begin, 0] = part.spans[0].rests[0] > 0.0
+            found[end - 1, -1] = part.spans[-1].rests[1] > 0.0
+        return found.ravel()
 
     def _at_given_speeds(self) -> NDArray[np.bool_]:
         """Points (npoints,) at which the rate is given."""
@@ -216,11 +240,14 @@ class _Signals:
         return found.ravel()
 
     def feasible_scale(self, local: Array, largest: float = 1.0) -> float:
-        """Largest multiple of a squared rate that satisfies the limits at the points, to `_SCALE`; 0 for none."""
+        """Largest multiple of a squared rate that satisfies the limits at the points, to `_SCALE`; 0 for none.
+
+        Limits that forbid a sign of a derivative do not depend on it.
+        """
         derivatives = self._derivatives(local)
 
         def beyond(scale: float) -> float:
-            return self._beyond(scale * derivatives)
+            return self._beyond(scale * derivatives, signed=False)
 
         low = high = 1.0
         while high < largest and beyond(high) <= 0.0:
@@ -265,8 +292,11 @@ class _Signals:
         )
         order = (0, 2, 1)
         upper, lower = (
-            ((side - constant).reshape(shape) - sign * reserve[:, None]).transpose(order).reshape(-1, length.size)
-            for side, sign in ((self._high, 1.0), (self._low, -1.0))
+            (side - constant - sign * reserve.repeat(self._points.size) * share)
+            .reshape(shape)
+            .transpose(order)
+            .reshape(-1, length.size)
+            for side, sign, share in ((self._high, 1.0, self._high_share), (self._low, -1.0, self._low_share))
         )
         rows = np.asarray(factors).transpose(0, 2, 1, 3).reshape(len(upper), length.size, -1)
         return Rows(rows, upper, lower)
@@ -279,19 +309,29 @@ class _Signals:
 
     def _values(self, derivatives: Array) -> Array:
         """Signals (nbounds, ..., npoints) in the scale of their limits, by derivatives (order, ..., npoints) of b."""
-        b, slope, bend, third, *_ = (*derivatives, *np.zeros(3))
-        rate = np.sqrt(np.maximum(b, 1e-300))
-        series = [rate, slope / 4.0, bend * rate / 12.0, (third * b + 0.5 * bend * slope) / 48.0][: self._order]
         shape = derivatives.shape[1:]
+        b, slope, bend, third, fourth = np.concatenate([derivatives, np.zeros((HIGHEST - self._order, *shape))])
+        rate = np.sqrt(np.maximum(b, 1e-300))
+        series = [
+            rate,
+            slope / 4.0,
+            bend * rate / 12.0,
+            (third * b + 0.5 * bend * slope) / 48.0,
+            (fourth * b + 1.5 * third * slope + 0.5 * bend**2) * rate / 240.0,
+        ][: self._order]
         path = [row.reshape(len(row), *np.ones(len(shape) - 1, dtype=int), -1) for row in self._path]
         rows = [np.broadcast_to(row, (len(row), *shape)) for row in composed(path, series)]
         jet = np.stack(rows).reshape(len(rows), len(path[0]), -1) * FACTORIALS[: self._order + 1, None, None]
         return (self._limited.values(jet)[self._moving] / self._scales).reshape(-1, *shape)
 
-    def _beyond(self, derivatives: Array) -> float:
-        """Maximum violation with half the reserve, in the scale of the limits, up to `_BEYOND`."""
+    def _beyond(self, derivatives: Array, signed: bool = True) -> float:
+        """Maximum violation with half the reserve, up to `_BEYOND`; also, if `signed`, of limits that forbid a sign."""
         try:
             values = self._values(derivatives)
         except ValueError:  # infeasible for the plant
             return _BEYOND
-        return min(float(np.maximum(values - self._high, self._low - values).max()) + 0.5 * _RESERVE, _BEYOND)
+        reserve = 0.5 * _RESERVE
+        excess = np.maximum(
+            values - self._high + reserve * self._high_share, self._low - values + reserve * self._low_share
+        )
+        return min(float(excess[signed | ~self.strict[:, 0]].max(initial=-_BEYOND)), _BEYOND)

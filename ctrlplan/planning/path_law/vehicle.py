@@ -76,12 +76,28 @@ def fastest_segment_law(part: PathPlan, limited: Limited, orders: Sequence[int])
         Of the limited signals, from `orders_on_path`.
     """
     forms = _Forms(part, limited)
+    _check_signs(forms, orders)
     second = [k for k, order in enumerate(orders) if order == 2]
     virtual = _Signals(forms, second)
     bounds = _over_time(partial(_fastest_rates, forms), 0, 1) if 1 in orders else []
     for axis, k in enumerate(second, 1):
         bounds += _over_time(partial(_differences, forms, k), axis, 2)
     return fastest_law(virtual, bounds, virtual.start, (0.0, 0.0)).plan.law
+
+
+def _check_signs(forms: _Forms, orders: Sequence[int]) -> None:
+    """Raise for signals of one sign that must have both, since the path parameter starts and stops at the ends."""
+    (curve,) = forms.plan.segments
+    constant, _, _, along = forms.inside(np.array([curve.start, curve.end]))
+    size = np.abs(along).max(axis=1, keepdims=True)
+    alone = (np.abs(along) > _SAME * size) & (np.abs(constant) <= _SAME * size)
+    for bound, order, accelerated in zip(forms.limited.bounds, orders, alone, strict=True):
+        if order == 2 and 0.0 in (bound.low, bound.high) and accelerated.any():
+            raise ValueError(
+                f"limits of {bound.name} must allow both signs, got {bound.range}: the plan is at rest at both ends of "
+                "each segment, where it is proportional to the acceleration along the path; give a small limit instead "
+                "of 0"
+            )
 
 
 def _intervals(plan: PathPlan) -> Array:
