@@ -37,8 +37,8 @@ from ctrlplan.trajectories.waypoint_spline import (
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
-_FEW, _DENSE = 16, 8
-"""Number of segments up to which few times are evaluated one by one; times per segment from which all are dense."""
+_FEW = 16
+"""Number of segments up to which each is evaluated by itself, at few times."""
 
 
 class PiecewiseSpline(WaypointSpline):
@@ -457,14 +457,13 @@ class PiecewiseSpline(WaypointSpline):
         if not (first > times[0] if left else first >= times[0]) or not last <= times[-1]:
             return super()._sample(t, low, high, left)
         with np.errstate(over="ignore", invalid="ignore"):
-            out = self._sample_inside(t, low, high, left, (first, last))
+            out = self._sample_inside(t, low, high, left)
         return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
-    def _sample_inside(self, t: Array, low: int, high: int, left: bool, span: tuple[float, float]) -> Array:
-        """Derivatives low to high at times of the plan, between the first and the last of them."""
+    def _sample_inside(self, t: Array, low: int, high: int, left: bool) -> Array:
+        """Derivatives low to high at times of the plan."""
         times = self.breakpoints
-        begin, end = times[1:-1].searchsorted(span).tolist()
-        if t.size > max(FEW, _DENSE * (end - begin)) and all([p.is_resolved(low, high) for p in self._pieces]):
+        if t.size > FEW and all([pieces.is_resolved(low, high) for pieces in self._pieces]):
             out = np.empty((high - low + 1, self.naxes, t.size))
             sample_segments(
                 times, lambda own: self._rows_of(own, low, high), self._filled[:, low : high + 1], t, left, out

@@ -46,6 +46,7 @@ _SHORT = 14
 _MAX_TERMS = 24
 _PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
 _CHUNK = 4104  # the functions stay in the second cache; no power of two, to avoid conflicts between rows
+_SPARSE = 32  # number of times per segment from which a matrix product for each segment is faster
 _BLOCK = 16 * _CHUNK  # number of times that are grouped together
 _LARGEST = 2.0**20  # bound of all functions of the bases
 
@@ -181,8 +182,11 @@ def _sample_grouped(
     starts, ends = times[segments], times[segments + 1]
     origin = starts.repeat(counts)
     bounds = counts.cumsum().tolist()
-    parts = zip(rows_of(segments), [0, *bounds[:-1]], bounds, strict=True)
-    evaluate(parts, t - origin, (ends - starts).repeat(counts), out)
+    rows, durations = rows_of(segments), (ends - starts).repeat(counts)
+    if t.size < _SPARSE * segments.size:
+        _evaluate_each(rows, np.arange(segments.size).repeat(counts), t - origin, durations, out)
+    else:
+        evaluate(zip(rows, [0, *bounds[:-1]], bounds, strict=True), t - origin, durations, out)
     where = (t == (ends.repeat(counts) if left else origin)).nonzero()[0]
     if where.size:
         _place_entries(entries[segments.repeat(counts)[where] + left], where, out)
@@ -227,11 +231,8 @@ def evaluate(parts: Iterable[tuple[Array, int, int]], t: Array, duration: Array 
     quarter = 0.25 * duration
     for begin in range(0, t.size, _CHUNK):
         end = min(begin + _CHUNK, t.size)
-        part = quarter if isinstance(quarter, float) else quarter[begin:end]
         functions = basis[:, : end - begin]
-        np.subtract(t[begin:end], 2.0 * part, out=functions[1])
-        functions[1] /= part
-        _products(functions)
+        _products(t[begin:end], quarter if isinstance(quarter, float) else quarter[begin:end], functions)
         while left and left[-1][1] < end:
             rows, first, last = left[-1]
             step = max(1, _PRODUCT // rows.size)
@@ -243,8 +244,31 @@ def evaluate(parts: Iterable[tuple[Array, int, int]], t: Array, duration: Array 
             left.pop()
 
 
-def _products(functions: Array) -> None:
-    """Functions (size, ntime) of the basis from the first two, 1 and V_1."""
+def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Array, out: Array) -> None:
+    """As `evaluate`, each time with its own rows, for few times of many segments.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (nsegments, norders * naxes, size)
+        Rows of the interpolants.
+    index : ndarray of int, shape (ntime,)
+        Place of the rows of each time among them.
+    """
+    target = out.reshape(-1, t.size)  # a view
+    basis = np.empty((max(rows.shape[2], 2), min(_CHUNK, t.size)))
+    basis[0] = 1.0
+    for begin in range(0, t.size, _CHUNK):
+        end = min(begin + _CHUNK, t.size)
+        functions = basis[:, : end - begin]
+        _products(t[begin:end], 0.25 * duration[begin:end], functions)
+        used = functions[: rows.shape[2]].T[:, :, None]
+        target[:, begin:end] = (rows[index[begin:end]] @ used)[:, :, 0].T
+
+
+def _products(t: Array, quarter: Array | float, functions: Array) -> None:
+    """Fill the basis (size, ntime) at times since the start, from quarters of the durations; the first one is 1."""
+    np.subtract(t, 2.0 * quarter, out=functions[1])
+    functions[1] /= quarter
     top, size = 1, len(functions)
     while 2 * top < size:
         square = functions[2 * top]
