@@ -432,7 +432,12 @@ class PiecewiseSpline(WaypointSpline):
 
     def _is_extreme(self, order: int) -> bool:
         """Whether powers of the durations may overflow."""
-        return max(abs(math.log10(self._durations.min())), abs(math.log10(self._durations.max()))) * order > _EXTREME
+        return self._exponent * order > _EXTREME
+
+    @cached_property
+    def _exponent(self) -> float:
+        """Maximum magnitude of the decimal exponents of the durations."""
+        return max(abs(math.log10(self._durations.min())), abs(math.log10(self._durations.max())))
 
     def _jets(self, segments: NDArray[np.intp], s: Array, low: int, high: int) -> Array:
         """Derivatives low to high, each time in its own segment."""
@@ -457,23 +462,22 @@ class PiecewiseSpline(WaypointSpline):
         if not (first > times[0] if left else first >= times[0]) or not last <= times[-1]:
             return super()._sample(t, low, high, left)
         with np.errstate(over="ignore", invalid="ignore"):
-            out = self._sample_inside(t, low, high, left)
-        return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
+            out, finite = self._sample_inside(t, low, high, left)
+        return out if finite or np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
-    def _sample_inside(self, t: Array, low: int, high: int, left: bool) -> Array:
-        """Derivatives low to high at times of the plan."""
+    def _sample_inside(self, t: Array, low: int, high: int, left: bool) -> tuple[Array, bool]:
+        """Derivatives low to high at times of the plan, and whether they are certainly finite."""
         times = self.breakpoints
         if t.size > FEW and all([pieces.is_resolved(low, high) for pieces in self._pieces]):
             out = np.empty((high - low + 1, self.naxes, t.size))
-            sample_segments(
-                times, lambda own: self._rows_of(own, low, high), self._filled[:, low : high + 1], t, left, out
-            )
-            return out
+            entries = self._filled[:, low : high + 1]
+            finite = sample_segments(times, lambda own: self._rows_of(own, low, high), entries, t, left, out)
+            return out, finite
         segments = times[1:-1].searchsorted(t, side="left" if left else "right")
         touched = int(np.count_nonzero(segments[1:] != segments[:-1])) + 1
         if touched <= _FEW:
-            return super()._sample(t, low, high, left)
-        return self._jets(segments, t - times[segments], low, high)
+            return super()._sample(t, low, high, left), True
+        return self._jets(segments, t - times[segments], low, high), False
 
     def _rows_of(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
         """Rows (nsegments, norders * naxes, nterms) of interpolants of segments."""

@@ -70,7 +70,7 @@ class Interpolant:
     def of(cls, coefficients: Array) -> Interpolant:
         """Interpolants from Chebyshev coefficients (norders, naxes, size)."""
         rows = in_products(coefficients.reshape(-1, coefficients.shape[2]))
-        return cls(readonly(rows), math.isfinite(_LARGEST * float(np.abs(rows).sum())))
+        return cls(readonly(rows), _are_finite(rows))
 
 
 def sample(
@@ -116,8 +116,8 @@ def sample_segments(
     t: Array,
     left: bool,
     out: Array,
-) -> None:
-    """Derivatives at many times of few segments, by interpolants of the segments.
+) -> bool:
+    """Derivatives at many times of several segments, by interpolants; whether they are certainly finite.
 
     Parameters
     ----------
@@ -136,19 +136,21 @@ def sample_segments(
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
     """
-    is_sorted = bool((t[1:] >= t[:-1]).all())
+    is_sorted, finite = bool((t[1:] >= t[:-1]).all()), True
     for begin in range(0, t.size, _BLOCK):
         part, place = t[begin : begin + _BLOCK], out[:, :, begin : begin + _BLOCK]
         if is_sorted:
-            _sample_grouped(times, rows_of, entries, part, left, *_groups_of_sorted(times, part, left), place)
+            groups = _groups_of_sorted(times, part, left)
+            finite &= _sample_grouped(times, rows_of, entries, part, left, *groups, place)
         else:
             segments = _segments_of(times, part, left)
             order = segments.astype(np.uint16 if times.size < 2**16 else np.intp).argsort(kind="stable")
             counts = np.bincount(segments)
             used = counts.nonzero()[0]
             found = np.empty(place.shape)
-            _sample_grouped(times, rows_of, entries, part[order], left, used, counts[used], found)
+            finite &= _sample_grouped(times, rows_of, entries, part[order], left, used, counts[used], found)
             place[:, :, order] = found
+    return finite
 
 
 def _segments_of(times: Array, t: Array, left: bool) -> NDArray[np.intp]:
@@ -177,7 +179,7 @@ def _sample_grouped(
     segments: NDArray[np.intp],
     counts: NDArray[np.intp],
     out: Array,
-) -> None:
+) -> bool:
     """As `sample_segments`, at times that are grouped by segment."""
     starts, ends = times[segments], times[segments + 1]
     origin = starts.repeat(counts)
@@ -194,6 +196,7 @@ def _sample_grouped(
         where = (t[bounds[-1] - counts[-1] :] == times[-1]).nonzero()[0] + (bounds[-1] - counts[-1])
         if where.size:
             _place_entries(entries[[-1]], where, out)
+    return _are_finite(rows)
 
 
 def _place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
@@ -201,6 +204,11 @@ def _place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
     rows, place = known.transpose(1, 2, 0), out[: known.shape[1]]
     free = np.isnan(rows)
     place[:, :, where] = np.where(free, place[:, :, where], rows) if free.any() else rows
+
+
+def _are_finite(coefficients: Array) -> bool:
+    """Whether coefficients exclude values that are not finite."""
+    return math.isfinite(_LARGEST * float(np.add.reduce(np.abs(coefficients), axis=None)))
 
 
 def in_products(coefficients: Array) -> Array:
@@ -376,17 +384,17 @@ def _sample_uniform(
     scale = radius ** np.arange(terms) / FACTORIALS[:terms]
     main = ncells * cell
     block = max(1, _PRODUCT // (terms * cell))
-    size = 0.0
+    finite = True
     for row in range(norders):
         table = np.ascontiguousarray(np.moveaxis(jets[low + row : low + row + terms], 0, -1) * scale)
-        size += float(np.abs(table).sum())
+        finite &= _are_finite(table)
         for axis in range(naxes):
             whole = out[row, axis, :main].reshape(ncells, cell)
             for begin in range(0, ncells, block):
                 np.matmul(table[axis, begin : min(begin + block, ncells)], powers, out=whole[begin : begin + block])
             if main < count:
                 np.matmul(table[axis, ncells], powers[:, : count - main], out=out[row, axis, main:])
-    return math.isfinite(_LARGEST * size)
+    return finite
 
 
 def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, terms: int, low: int, out: Array) -> bool:
@@ -410,7 +418,7 @@ def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, te
             powers[1] /= radius
             _powers(powers)
             np.matmul(table[k], powers[:terms], out=flat[:, begin:end])
-    return math.isfinite(_LARGEST * float(np.abs(table).sum()))
+    return _are_finite(table)
 
 
 def _powers(functions: Array) -> None:
