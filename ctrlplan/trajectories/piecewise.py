@@ -38,7 +38,7 @@ _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
 _FEW = 16
-"""Number of segments up to which each is evaluated by itself, at few times."""
+"""Number of segments up to which each is evaluated by itself at few times, and interpolants are kept."""
 
 
 class PiecewiseSpline(WaypointSpline):
@@ -471,13 +471,29 @@ class PiecewiseSpline(WaypointSpline):
         if t.size > FEW and all([pieces.is_resolved(low, high) for pieces in self._pieces]):
             out = np.empty((high - low + 1, self.naxes, t.size))
             entries = self._filled[:, low : high + 1]
-            finite = sample_segments(times, lambda own: self._rows_of(own, low, high), entries, t, left, out)
+            known = self._known_rows(low, high)
+            finite = sample_segments(
+                times, lambda own: self._rows_of(own, low, high) if known is None else known[own], entries, t, left, out
+            )
             return out, finite
         segments = times[1:-1].searchsorted(t, side="left" if left else "right")
         touched = int(np.count_nonzero(segments[1:] != segments[:-1])) + 1
         if touched <= _FEW:
             return super()._sample(t, low, high, left), True
         return self._jets(segments, t - times[segments], low, high), False
+
+    def _known_rows(self, low: int, high: int) -> Array | None:
+        """Rows of interpolants of all segments, kept with a plan of few segments; None for others."""
+        if self._durations.size > _FEW:
+            return None
+        if (low, high) not in self._rows_by_orders:
+            self._rows_by_orders[low, high] = readonly(self._rows_of(np.arange(self._durations.size), low, high))
+        return self._rows_by_orders[low, high]
+
+    @cached_property
+    def _rows_by_orders(self) -> dict[tuple[int, int], Array]:
+        """Rows of interpolants by lowest and highest order."""
+        return {}
 
     def _rows_of(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
         """Rows (nsegments, norders * naxes, nterms) of interpolants of segments."""
