@@ -68,8 +68,8 @@ class Interpolant:
 
     @classmethod
     def of(cls, coefficients: Array) -> Interpolant:
-        """Interpolants from Chebyshev coefficients (norders, naxes, size)."""
-        rows = in_products(coefficients.reshape(-1, coefficients.shape[2]))
+        """Interpolants from coefficients of products (norders, naxes, size)."""
+        rows = coefficients.reshape(-1, coefficients.shape[2])
         return cls(readonly(rows), _are_finite(rows))
 
 
