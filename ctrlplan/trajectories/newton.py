@@ -573,7 +573,7 @@ def shared_system(
     smooth: int,
     meet: bool,
 ) -> NewtonSystem:
-    """System for few waypoints, shared by all plans with these relative times, as by all moves from point to point."""
+    """System that is shared by all plans with these relative times, as by all moves between two waypoints."""
     return NewtonSystem(alpha, np.array(times), given, gamma, size, smooth, meet)
 
 

@@ -23,8 +23,8 @@ from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing, within
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
 
-_SHARED = 8
-"""Number of waypoints up to which systems are shared by plans."""
+_SHARED = 24
+"""Number of coefficients up to which systems are shared by plans, so that few kilobytes are kept for each."""
 
 Given = tuple[tuple[int, ...], ...]
 Kind = tuple[Given, float | None, bool]
@@ -134,15 +134,11 @@ class NewtonSpline(WaypointSpline):
         systems: dict[Kind, NewtonSystem] = {}
         parts = []
         for kind, axes in _groups(patterns, options.gamma, _meeting(table, alpha)).items():
-            given, gamma, meet = kind
+            given, _, _ = kind
             system = lent.get(kind)
             if system is None:
                 size = _size(alpha, sum(map(len, given)), options.degree)
-                if apart is None and len(times) <= _SHARED:
-                    moments = tuple(relative.tolist())
-                    system = shared_system(alpha, moments, given, gamma, size, options.smooth, meet)
-                else:
-                    system = NewtonSystem(alpha, relative, given, gamma, size, options.smooth, meet, apart)
+                system = _system(alpha, relative, apart, kind, size, options.smooth)
             systems[kind] = system
             data = table[system.waypoint_index, system.order_index]
             if len(axes) < table.shape[2]:
@@ -329,6 +325,16 @@ class NewtonSpline(WaypointSpline):
 
     def _facts(self) -> list[tuple[str, str]]:
         return [*super()._facts(), ("alpha", f"{number(self.alpha)} rad" if self.alpha else "")]
+
+
+def _system(
+    alpha: float, relative: Array, apart: Array | None, kind: Kind, size: int | None, smooth: int
+) -> NewtonSystem:
+    """System for a pattern of entries; of few entries that of earlier plans with the same relative times."""
+    given, gamma, meet = kind
+    if apart is None and (size or sum(map(len, given))) <= _SHARED:
+        return shared_system(alpha, tuple(relative.tolist()), given, gamma, size, smooth, meet)
+    return NewtonSystem(alpha, relative, given, gamma, size, smooth, meet, apart)
 
 
 def _solved(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:
