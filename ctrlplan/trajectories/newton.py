@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from scipy.linalg import blas
 
 from ctrlplan._types import Value
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy, transform, unit_points
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
 from ctrlplan.trajectories.fields import Fields
@@ -78,6 +78,9 @@ MAXIMUM_LOSS = 1e-6
 
 _MAXIMUM_DIGITS = 100
 """Maximum number of constraints for decimal arithmetic, which then takes a fraction of a second."""
+
+_RESOLVED = 3e-14
+"""Size of the last coefficients of an interpolant relative to the largest, below which others do not matter."""
 
 _ELEMENTARY = 3
 """Highest order of Taylor coefficients from elementary symmetric sums."""
@@ -162,8 +165,8 @@ class NewtonSystem(Fields):
             alpha=alpha,
             size=size,
             gamma=phase,
-            waypoint_index=readonly(waypoints),
-            order_index=readonly(orders),
+            waypoint_index=waypoints,
+            order_index=orders,
             _orders=tuple(orders.tolist()),
             _fold=fold,
             _nodes=readonly(nodes),
@@ -342,7 +345,7 @@ class NewtonSystem(Fields):
         if not apart.all():
             return self.taylor(u, order).transpose(1, 0, 2)
         out = np.zeros((order + 1, count + 1, u.size))
-        value, sums = out[0], out[1:]
+        value = out[0]
         value[0] = 1.0
         if half:
             apart *= half
@@ -352,15 +355,49 @@ class NewtonSystem(Fields):
             ratio = 1.0 / apart
         np.multiply.accumulate(apart, axis=0, out=value[1:])
         terms = ratio
-        for row in sums:
-            np.add.accumulate(terms, axis=0, out=row[1:])
-            terms = ratio * row[:-1]
+        for k in range(1, order + 1):
+            np.add.accumulate(terms, axis=0, out=out[k, 1:])
+            if k < order:
+                terms = ratio * out[k, :-1]
         if half:
             _change_to_cosines(out, cosine[1::2], ratio[1::2], half)
-        sums *= value
+        out[1:] *= value
         if self._fold:
             out[:, self.size - 1] += self._fold * out[:, self.size]
         return out[:, : self.size]
+
+    def interpolant(self, low: int, high: int) -> Array | None:
+        """Interpolants (high - low + 1, size, nterms) of derivatives of the basis on the unit interval.
+
+        By the products of `sampling`; None where they are not resolved.
+        """
+        if (low, high) not in self._interpolants:
+            found = self._chebyshev(low, high)
+            self._interpolants[low, high] = None if found is None else readonly(in_products(found))
+        return self._interpolants[low, high]
+
+    @cached_property
+    def _interpolants(self) -> dict[tuple[int, int], Array | None]:
+        """Interpolants by lowest and highest order."""
+        return {}
+
+    def _chebyshev(self, low: int, high: int) -> Array | None:
+        """Chebyshev coefficients of derivatives of the basis on the unit interval; None where they are not resolved."""
+        # A polynomial is its own interpolant; other functions have more terms. An even number of points avoids the
+        # middle of the interval, where a waypoint often is.
+        terms = self.size + math.ceil(self.alpha and 10.0 + self.alpha * (2.3 + 0.18 * self.size))
+        u, scale = unit_points(terms + terms % 2 - 1), FACTORIALS[: high + 1, None, None]
+        found = transform(self.taylor_between(u, high)[low:] * scale[low:])
+        if not self.alpha:
+            return found[..., :terms]
+        sizes = np.abs(found)
+        if not (sizes[..., -2:].max(axis=2) > _RESOLVED * sizes.max(axis=2)).any():
+            return found
+
+        def jet(u: Array, order: int) -> Array:
+            return self.taylor(u, order).transpose(1, 0, 2) * scale[: order + 1]
+
+        return chebyshev_proxy(jet, (0.0, 1.0), low, high)
 
     def series(self, coefficients: Array, u: Value, order: int) -> list[list[Value]]:
         """Taylor series of each axis at one normalised time, a number or a symbol."""
@@ -525,6 +562,20 @@ def _factors(count: int) -> Array:
     """Number of factors of each function, (count, 1)."""
     number = np.arange(float(count))
     return readonly((number + number % 2.0)[:, None])
+
+
+@lru_cache(maxsize=256)
+def shared_system(
+    alpha: float,
+    times: tuple[float, ...],
+    given: tuple[tuple[int, ...], ...],
+    gamma: float | None,
+    size: int | None,
+    smooth: int,
+    meet: bool,
+) -> NewtonSystem:
+    """System that is shared by all plans with these relative times, as by all moves between two waypoints."""
+    return NewtonSystem(alpha, np.array(times), given, gamma, size, smooth, meet)
 
 
 @lru_cache(maxsize=256)
@@ -724,20 +775,6 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: in
             )
         spread = spread + basis[:, count:] @ free
     return np.asfortranarray(triangle), spread
-
-
-@lru_cache(maxsize=128)
-def basis_interpolant(system: NewtonSystem, low: int, high: int) -> Array | None:
-    """Interpolants (high - low + 1, size, nterms) of derivatives of the basis on the unit interval.
-
-    None where they are not resolved.
-    """
-
-    def jet(u: Array, order: int) -> Array:
-        return system.taylor(u, order).transpose(1, 0, 2) * FACTORIALS[: order + 1, None, None]
-
-    found = chebyshev_proxy(jet, (0.0, 1.0), low, high)
-    return None if found is None else readonly(in_products(found))
 
 
 @lru_cache(maxsize=256)

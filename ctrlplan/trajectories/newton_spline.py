@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -15,17 +14,17 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.chebyshev import transform, unit_points
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.extrema import keep_places
-from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
+from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, shared_system
 from ctrlplan.trajectories.one_time import derivatives, is_moderate
+from ctrlplan.trajectories.sampling import Interpolant
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing, within
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
 
-_RESOLVED = 3e-14
-"""Size of the last coefficients of an interpolant relative to the largest, below which others do not matter."""
+_SHARED = 24
+"""Number of coefficients up to which systems are shared by plans, so that few kilobytes are kept for each."""
 
 Given = tuple[tuple[int, ...], ...]
 Kind = tuple[Given, float | None, bool]
@@ -135,11 +134,11 @@ class NewtonSpline(WaypointSpline):
         systems: dict[Kind, NewtonSystem] = {}
         parts = []
         for kind, axes in _groups(patterns, options.gamma, _meeting(table, alpha)).items():
-            given, gamma, meet = kind
+            given, _, _ = kind
             system = lent.get(kind)
             if system is None:
                 size = _size(alpha, sum(map(len, given)), options.degree)
-                system = NewtonSystem(alpha, relative, given, gamma, size, options.smooth, meet, apart)
+                system = _system(alpha, relative, apart, kind, size, options.smooth)
             systems[kind] = system
             data = table[system.waypoint_index, system.order_index]
             if len(axes) < table.shape[2]:
@@ -247,22 +246,20 @@ class NewtonSpline(WaypointSpline):
             out[:, list(axes)] = values
         return out
 
-    def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
-        size = max([system.size for _, system, _ in self._parts])
-        # A polynomial is its own interpolant; other functions have more terms. An even number of points avoids the
-        # middle of the interval, where a waypoint often is.
-        terms = size + math.ceil(self.alpha and 8.0 + self.alpha * (2.3 + 0.16 * size))
-        u = unit_points(terms + terms % 2 - 1)
-        values = np.empty((high - low + 1, self.naxes, u.size))
+    def _new_interpolant(self, segment: int, low: int, high: int) -> Interpolant | None:
+        found = []
         for axes, system, coefficients in self._parts:
-            values[:, list(axes)] = coefficients.T @ system.taylor_between(u, high)[low:]
-        values *= derivative_scale(self._duration, high)[low:, None, None]
-        coefficients = transform(values)
-        if not self.alpha:
-            return coefficients[..., :terms]
-        sizes = np.abs(coefficients)
-        missed = sizes[..., -2:].max(axis=2) > _RESOLVED * sizes.max(axis=2)
-        return super()._segment_proxy(segment, low, high) if missed.any() else coefficients
+            basis = system.interpolant(low, high)
+            if basis is None:
+                return super()._new_interpolant(segment, low, high)
+            found.append((axes, coefficients.T @ basis))
+        rows = found[0][1]
+        if len(found) > 1:
+            rows = np.zeros((high - low + 1, self.naxes, max([own.shape[2] for _, own in found])))
+            for axes, own in found:
+                rows[:, list(axes), : own.shape[2]] = own
+        powers = self._duration ** -np.arange(low, high + 1.0)
+        return Interpolant.of(rows * powers[:, None, None])
 
     def _end_jet(self, segment: int, s: float, order: int) -> Array:
         # What a waypoint prescribes is not computed.
@@ -328,6 +325,16 @@ class NewtonSpline(WaypointSpline):
 
     def _facts(self) -> list[tuple[str, str]]:
         return [*super()._facts(), ("alpha", f"{number(self.alpha)} rad" if self.alpha else "")]
+
+
+def _system(
+    alpha: float, relative: Array, apart: Array | None, kind: Kind, size: int | None, smooth: int
+) -> NewtonSystem:
+    """System for a pattern of entries; of few entries that of earlier plans with the same relative times."""
+    given, gamma, meet = kind
+    if apart is None and (size or sum(map(len, given))) <= _SHARED:
+        return shared_system(alpha, tuple(relative.tolist()), given, gamma, size, smooth, meet)
+    return NewtonSystem(alpha, relative, given, gamma, size, smooth, meet, apart)
 
 
 def _solved(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:

@@ -14,7 +14,7 @@ from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale, readonly
 from ctrlplan.trajectories.conjugate import SHORT, Kind, segment_system
 from ctrlplan.trajectories.fields import Fields
-from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, basis_interpolant
+from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 
 _AMPLIFIED = 1e4
 """Amplification of rounding errors above which each segment is fitted with a check of its accuracy."""
@@ -103,13 +103,13 @@ class Pieces(Fields):
 
     def is_resolved(self, low: int, high: int) -> bool:
         """Whether derivatives of all segments have interpolants."""
-        return all([basis_interpolant(run.system, low, high) is not None for run in self.runs])
+        return all([run.system.interpolant(low, high) is not None for run in self.runs])
 
     def rows(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
         """Coefficients (nsegments, high - low + 1, naxes, nterms) of interpolants by relative time, if resolved."""
         found = []
         for run in self.runs:
-            basis = basis_interpolant(run.system, low, high)
+            basis = run.system.interpolant(low, high)
             if basis is not None:
                 found.append((run, basis))
         if len(found) == 1:

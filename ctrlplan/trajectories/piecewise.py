@@ -37,8 +37,8 @@ from ctrlplan.trajectories.waypoint_spline import (
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
-_FEW, _DENSE = 16, 8
-"""Number of segments up to which few times are evaluated one by one; times per segment from which all are dense."""
+_FEW = 16
+"""Number of segments up to which each is evaluated by itself at few times, and interpolants are kept."""
 
 
 class PiecewiseSpline(WaypointSpline):
@@ -431,7 +431,12 @@ class PiecewiseSpline(WaypointSpline):
 
     def _is_extreme(self, order: int) -> bool:
         """Whether powers of the durations may overflow."""
-        return max(abs(math.log10(self._durations.min())), abs(math.log10(self._durations.max()))) * order > _EXTREME
+        return self._exponent * order > _EXTREME
+
+    @cached_property
+    def _exponent(self) -> float:
+        """Maximum magnitude of the decimal exponents of the durations."""
+        return max(abs(math.log10(self._durations.min())), abs(math.log10(self._durations.max())))
 
     def _jets(self, segments: NDArray[np.intp], s: Array, low: int, high: int) -> Array:
         """Derivatives low to high, each time in its own segment."""
@@ -462,23 +467,38 @@ class PiecewiseSpline(WaypointSpline):
             out[:, :, ~inside] = super()._sample(t[~inside], low, high, left)
             return out
         with np.errstate(over="ignore", invalid="ignore"):
-            out = self._sample_inside(t, low, high, left, (first, last))
-        return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
+            out, finite = self._sample_inside(t, low, high, left)
+        return out if finite or np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
-    def _sample_inside(self, t: Array, low: int, high: int, left: bool, span: tuple[float, float]) -> Array:
-        """Derivatives low to high at times of the plan, between the first and the last of them."""
+    def _sample_inside(self, t: Array, low: int, high: int, left: bool) -> tuple[Array, bool]:
+        """Derivatives low to high at times of the plan, and whether they are certainly finite."""
         times = self.breakpoints
-        begin, end = times[1:-1].searchsorted(span).tolist()
-        if t.size > max(FEW, _DENSE * (end - begin)) and all([p.is_resolved(low, high) for p in self._pieces]):
+        if t.size > FEW and all([pieces.is_resolved(low, high) for pieces in self._pieces]):
             out = np.empty((high - low + 1, self.naxes, t.size))
             entries = self._filled[:, low : high + 1].transpose(2, 1, 0)
-            sample_segments(times, lambda own: self._rows_of(own, low, high), entries, t, left, out)
-            return out
+            known = self._known_rows(low, high)
+            finite = sample_segments(
+                times, lambda own: self._rows_of(own, low, high) if known is None else known[own], entries, t, left, out
+            )
+            return out, finite
         segments = times[1:-1].searchsorted(t, side="left" if left else "right")
         touched = int(np.count_nonzero(segments[1:] != segments[:-1])) + 1
         if touched <= _FEW:
-            return super()._sample(t, low, high, left)
-        return self._jets(segments, t - times[segments], low, high)
+            return super()._sample(t, low, high, left), True
+        return self._jets(segments, t - times[segments], low, high), False
+
+    def _known_rows(self, low: int, high: int) -> Array | None:
+        """Rows of interpolants of all segments, kept with a plan of few segments; None for others."""
+        if self._durations.size > _FEW:
+            return None
+        if (low, high) not in self._rows_by_orders:
+            self._rows_by_orders[low, high] = readonly(self._rows_of(np.arange(self._durations.size), low, high))
+        return self._rows_by_orders[low, high]
+
+    @cached_property
+    def _rows_by_orders(self) -> dict[tuple[int, int], Array]:
+        """Rows of interpolants by lowest and highest order."""
+        return {}
 
     def _rows_of(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
         """Rows (nsegments, norders * naxes, nterms) of interpolants of segments."""

@@ -46,6 +46,7 @@ _SHORT = 14
 _MAX_TERMS = 24
 _PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
 _CHUNK = 4104  # the functions stay in the second cache; no power of two, to avoid conflicts between rows
+_SPARSE = 32  # number of times per segment from which a matrix product for each segment is faster
 _BLOCK = 16 * _CHUNK  # number of times that are grouped together
 _LARGEST = 2.0**20  # bound of all functions of the bases
 
@@ -67,9 +68,9 @@ class Interpolant:
 
     @classmethod
     def of(cls, coefficients: Array) -> Interpolant:
-        """Interpolants from Chebyshev coefficients (norders, naxes, size)."""
-        rows = in_products(coefficients.reshape(-1, coefficients.shape[2]))
-        return cls(readonly(rows), math.isfinite(_LARGEST * float(np.abs(rows).sum())))
+        """Interpolants from coefficients of products (norders, naxes, size)."""
+        rows = coefficients.reshape(-1, coefficients.shape[2])
+        return cls(readonly(rows), _are_finite(rows))
 
 
 def sample(
@@ -115,8 +116,8 @@ def sample_segments(
     t: Array,
     left: bool,
     out: Array,
-) -> None:
-    """Derivatives at many times of few segments, by interpolants of the segments.
+) -> bool:
+    """Derivatives at many times of several segments, by interpolants; whether they are certainly finite.
 
     Parameters
     ----------
@@ -135,19 +136,21 @@ def sample_segments(
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
     """
-    is_sorted = bool((t[1:] >= t[:-1]).all())
+    is_sorted, finite = bool((t[1:] >= t[:-1]).all()), True
     for begin in range(0, t.size, _BLOCK):
         part, place = t[begin : begin + _BLOCK], out[:, :, begin : begin + _BLOCK]
         if is_sorted:
-            _sample_grouped(times, rows_of, entries, part, left, *_groups_of_sorted(times, part, left), place)
+            groups = _groups_of_sorted(times, part, left)
+            finite &= _sample_grouped(times, rows_of, entries, part, left, *groups, place)
         else:
             segments = _segments_of(times, part, left)
             order = segments.astype(np.uint16 if times.size < 2**16 else np.intp).argsort(kind="stable")
             counts = np.bincount(segments)
             used = counts.nonzero()[0]
             found = np.empty(place.shape)
-            _sample_grouped(times, rows_of, entries, part[order], left, used, counts[used], found)
+            finite &= _sample_grouped(times, rows_of, entries, part[order], left, used, counts[used], found)
             place[:, :, order] = found
+    return finite
 
 
 def _segments_of(times: Array, t: Array, left: bool) -> NDArray[np.intp]:
@@ -176,13 +179,16 @@ def _sample_grouped(
     segments: NDArray[np.intp],
     counts: NDArray[np.intp],
     out: Array,
-) -> None:
+) -> bool:
     """As `sample_segments`, at times that are grouped by segment."""
     starts, ends = times[segments], times[segments + 1]
     origin = starts.repeat(counts)
     bounds = counts.cumsum().tolist()
-    parts = zip(rows_of(segments), [0, *bounds[:-1]], bounds, strict=True)
-    evaluate(parts, t - origin, (ends - starts).repeat(counts), out)
+    rows, durations = rows_of(segments), (ends - starts).repeat(counts)
+    if t.size < _SPARSE * segments.size:
+        _evaluate_each(rows, np.arange(segments.size).repeat(counts), t - origin, durations, out)
+    else:
+        evaluate(zip(rows, [0, *bounds[:-1]], bounds, strict=True), t - origin, durations, out)
     where = (t == (ends.repeat(counts) if left else origin)).nonzero()[0]
     if where.size:
         _place_entries(entries[segments.repeat(counts)[where] + left], where, out)
@@ -190,6 +196,7 @@ def _sample_grouped(
         where = (t[bounds[-1] - counts[-1] :] == times[-1]).nonzero()[0] + (bounds[-1] - counts[-1])
         if where.size:
             _place_entries(entries[[-1]], where, out)
+    return _are_finite(rows)
 
 
 def _place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
@@ -197,6 +204,11 @@ def _place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
     rows, place = known.transpose(1, 2, 0), out[: known.shape[1]]
     free = np.isnan(rows)
     place[:, :, where] = np.where(free, place[:, :, where], rows) if free.any() else rows
+
+
+def _are_finite(coefficients: Array) -> bool:
+    """Whether coefficients exclude values that are not finite."""
+    return math.isfinite(_LARGEST * float(np.add.reduce(np.abs(coefficients), axis=None)))
 
 
 def in_products(coefficients: Array) -> Array:
@@ -227,11 +239,8 @@ def evaluate(parts: Iterable[tuple[Array, int, int]], t: Array, duration: Array 
     quarter = 0.25 * duration
     for begin in range(0, t.size, _CHUNK):
         end = min(begin + _CHUNK, t.size)
-        part = quarter if isinstance(quarter, float) else quarter[begin:end]
         functions = basis[:, : end - begin]
-        np.subtract(t[begin:end], 2.0 * part, out=functions[1])
-        functions[1] /= part
-        _products(functions)
+        _products(t[begin:end], quarter if isinstance(quarter, float) else quarter[begin:end], functions)
         while left and left[-1][1] < end:
             rows, first, last = left[-1]
             step = max(1, _PRODUCT // rows.size)
@@ -243,8 +252,31 @@ def evaluate(parts: Iterable[tuple[Array, int, int]], t: Array, duration: Array 
             left.pop()
 
 
-def _products(functions: Array) -> None:
-    """Functions (size, ntime) of the basis from the first two, 1 and V_1."""
+def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Array, out: Array) -> None:
+    """As `evaluate`, each time with its own rows, for few times of many segments.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (nsegments, norders * naxes, size)
+        Rows of the interpolants.
+    index : ndarray of int, shape (ntime,)
+        Place of the rows of each time among them.
+    """
+    target = out.reshape(-1, t.size)  # a view
+    basis = np.empty((max(rows.shape[2], 2), min(_CHUNK, t.size)))
+    basis[0] = 1.0
+    for begin in range(0, t.size, _CHUNK):
+        end = min(begin + _CHUNK, t.size)
+        functions = basis[:, : end - begin]
+        _products(t[begin:end], 0.25 * duration[begin:end], functions)
+        used = functions[: rows.shape[2]].T[:, :, None]
+        target[:, begin:end] = (rows[index[begin:end]] @ used)[:, :, 0].T
+
+
+def _products(t: Array, quarter: Array | float, functions: Array) -> None:
+    """Fill the basis (size, ntime) at times since the start, from quarters of the durations; the first one is 1."""
+    np.subtract(t, 2.0 * quarter, out=functions[1])
+    functions[1] /= quarter
     top, size = 1, len(functions)
     while 2 * top < size:
         square = functions[2 * top]
@@ -352,17 +384,17 @@ def _sample_uniform(
     scale = radius ** np.arange(terms) / FACTORIALS[:terms]
     main = ncells * cell
     block = max(1, _PRODUCT // (terms * cell))
-    size = 0.0
+    finite = True
     for row in range(norders):
         table = np.ascontiguousarray(np.moveaxis(jets[low + row : low + row + terms], 0, -1) * scale)
-        size += float(np.abs(table).sum())
+        finite &= _are_finite(table)
         for axis in range(naxes):
             whole = out[row, axis, :main].reshape(ncells, cell)
             for begin in range(0, ncells, block):
                 np.matmul(table[axis, begin : min(begin + block, ncells)], powers, out=whole[begin : begin + block])
             if main < count:
                 np.matmul(table[axis, ncells], powers[:, : count - main], out=out[row, axis, main:])
-    return math.isfinite(_LARGEST * size)
+    return finite
 
 
 def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, terms: int, low: int, out: Array) -> bool:
@@ -386,7 +418,7 @@ def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, te
             powers[1] /= radius
             _powers(powers)
             np.matmul(table[k], powers[:terms], out=flat[:, begin:end])
-    return math.isfinite(_LARGEST * float(np.abs(table).sum()))
+    return _are_finite(table)
 
 
 def _powers(functions: Array) -> None:

@@ -1178,8 +1178,7 @@ class Trajectory(Displayed, Fields, ABC):
         """Interpolants of derivatives low to high on a segment; None where they are not resolved."""
         known, key = self._interpolants, (segment, low, high)
         if key not in known:
-            proxy = self._segment_proxy(segment, low, high)
-            known[key] = None if proxy is None else _sampling.Interpolant.of(proxy)
+            known[key] = self._new_interpolant(segment, low, high)
         return known[key]
 
     @cached_property
@@ -1198,10 +1197,11 @@ class Trajectory(Displayed, Fields, ABC):
         """Jets at ends of segments, by segment, time from its start and order."""
         return {}
 
-    def _segment_proxy(self, segment: int, low: int, high: int) -> Array | None:
-        """Chebyshev coefficients (high - low + 1, naxes, size) of derivatives on a segment; None if unresolved."""
+    def _new_interpolant(self, segment: int, low: int, high: int) -> _sampling.Interpolant | None:
+        """As `_interpolant`, from values of the segment."""
         length = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
-        return chebyshev_proxy(lambda u, order: self.segment_jet(segment, u, order), (0.0, length), low, high)
+        found = chebyshev_proxy(lambda u, order: self.segment_jet(segment, u, order), (0.0, length), low, high)
+        return None if found is None else _sampling.Interpolant.of(_sampling.in_products(found))
 
     def _extreme_jet(self, segment: int, s: Array, low: int, high: int) -> Array:
         """Derivatives low to high of a segment whose duration to the power of their order overflows."""

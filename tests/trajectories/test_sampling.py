@@ -261,6 +261,24 @@ def test_functions_at_nodes_and_of_high_orders_are_those_of_all_times():
         np.testing.assert_array_equal(system.taylor_between(u, order), system.taylor(u, order).transpose(1, 0, 2))
 
 
+@pytest.mark.parametrize("alpha", [0.0, 2.0])
+def test_plans_with_the_same_relative_times_share_their_system(alpha):
+    """Twice as long: each derivative is divided by a power of two, in every bit. Other options are other systems."""
+    rng = np.random.default_rng(13)
+    jets, powers = rng.normal(size=(2, 3, 2)), 0.5 ** np.arange(3)[:, None]
+
+    def plan(times, scale, **options):
+        points = [Waypoint(t, *(jet * scale)) for t, jet in zip(times, jets, strict=True)]
+        return TrigSpline(points, alpha=alpha, **options) if alpha else PolySpline(points, **options)
+
+    short, long, rich = plan([0.0, 1.5], 1.0), plan([4.0, 7.0], powers), plan([0.0, 1.5], 1.0, degree=7)
+    assert short._parts[0][1] is long._parts[0][1]
+    assert rich._parts[0][1] is not short._parts[0][1]
+    t = np.linspace(0.0, 1.5, 385)
+    np.testing.assert_array_equal(long.jet(4.0 + 2.0 * t, 2), short.jet(t, 2) * powers[:, :, None])
+    np.testing.assert_array_equal(long.jet(4.75, 2), short.jet(0.375, 2) * powers)
+
+
 ENDS = {
     "polynomial": lambda points: PolySpline(points),
     "trigonometric": lambda points: TrigSpline(points, alpha=2.3),
