@@ -514,13 +514,14 @@ def _followed(early: Array, change: Array, terms: Array) -> Array:
 def _marched(state: Array, changes: list[Array], series: Array) -> Array:
     """States (nsystems, n, ncells + 1) at the ends of cells, with the input terms (nterms, ninputs, ncells)."""
     (count, n), ncells = state.shape, series.shape[2]
-    states = np.empty((count, n, ncells + 1))
-    states[:, :, 0] = state
+    rows = np.empty((ncells + 1, count, n))
+    rows[0] = state
     change = changes[-1][..., :n]
-    forced = changes[-1][..., n:] @ series.reshape(-1, ncells)
+    forced = np.moveaxis(changes[-1][..., n:] @ series.reshape(-1, ncells), 2, 0).copy()
     for k in range(ncells):
-        state = state + ((change @ state[:, :, None])[:, :, 0] + forced[:, :, k])
-        states[:, :, k + 1] = state
+        state = state + ((change @ state[:, :, None])[:, :, 0] + forced[k])
+        rows[k + 1] = state
+    states = np.moveaxis(rows, 0, 2)
     for i, found in enumerate(states):
         for k in range(_first_overflow(found), ncells + 1):
             if k:

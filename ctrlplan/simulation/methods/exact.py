@@ -137,6 +137,8 @@ def _run(job: Job, form: LinearForm) -> Record:
         return Snapshot(t, x, values[: job.prepared.ninputs], form.outputs(x, values))
 
     def states_at(t: Array, state: Array, a: Array = form.a) -> Array:
+        if sampled.size and sampled.all():
+            return _finite(sampled_states(a, form.b, signal_values(time_signals, t), t, state))
         found = None
         if len(a) > _MANY_STATES or (len(a) and len(breakpoints) > _MANY_SEGMENTS):
             marks = np.unique(breakpoints)
