@@ -18,7 +18,7 @@ from ctrlplan.symbolic.trials import can_remember
 from ctrlplan.traits import BlockFunction
 
 _EVENT_TIMES = 400, 20_000
-"""Minimum and maximum number of evenly spaced times of a run, no farther apart than which are those of events."""
+"""Minimum and maximum number of evenly spaced times whose distance is the longest between evaluations of events."""
 
 _EVENT_TIMES_A_PERIOD = 16
 """Number of such times per period of the fastest oscillation about the initial state."""

@@ -101,9 +101,9 @@ def simulate(
         Limits of signals whose crossings are recorded and may end the run, in
         addition to those that blocks declare, as a PID does. None, the default:
         the declared ones only. An empty sequence: no events, declared ones
-        included. Signals are evaluated at the sample times and sixteen times
-        per period of the loop's fastest oscillation; crossings closer together
-        require closer sample times.
+        included. Signals are evaluated at the sample times and, where these are
+        farther apart, sixteen times per period of the loop's fastest oscillation;
+        crossings closer together require closer sample times.
 
     Returns
     -------
