@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -256,15 +257,20 @@ class Entries:
     def of(cls, waypoints: Sequence[Waypoint]) -> Entries:
         """Entries of waypoints with equal axes."""
         jets = [point.jet for point in waypoints]
-        counts = np.array([len(jet) for jet in jets])
-        rows, naxes = int(counts.max()), jets[0].shape[1]
-        joined = np.concatenate(jets)
-        if counts.min() == rows:
+        sizes = list(map(len, jets))
+        rows, naxes = max(sizes), jets[0].shape[1]
+        try:
+            # A quarter of the time of np.concatenate.
+            joined = np.frombuffer(b"".join(cast("Sequence[bytes]", jets))).reshape(-1, naxes)
+        except TypeError:  # not contiguous: parts of a larger table
+            joined = np.concatenate(jets)
+        counts = np.array(sizes)
+        if min(sizes) == rows:
             table = joined.reshape(-1, rows, naxes)
         else:
             table = np.full((len(jets), rows, naxes), np.nan)
             table[np.arange(rows) < counts[:, None]] = joined
-        times = readonly(np.array([point.time for point in waypoints]))
+        times = readonly(np.fromiter([point.time for point in waypoints], float, len(jets)))
         return cls(times, readonly(table), counts, waypoints[0].labels)
 
     @cached_property

@@ -361,6 +361,35 @@ def test_waypoints_of_a_plan_cannot_change_it():
     assert points[2] == Waypoint(times[2], values[:, 2], [0.25, 0.25], [FREE, FREE])
     with pytest.raises(ValueError, match="read-only"):
         points[0].jet[0, 0] = 1.0
+    again = PiecewiseSpline(points)  # the jets are parts of one table
+    t = np.linspace(times[0], times[-1], 55)
+    wanted = PiecewiseSpline([Waypoint(p.time, *p.jet) for p in points])
+    np.testing.assert_array_equal(again.jet(t, 2), wanted.jet(t, 2))
+
+
+def test_times_before_and_after_a_plan_change_no_others():
+    times, values = data(60, 2)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(60, 2))
+    inside = np.linspace(times[0], times[-1], 200)[1:-1]
+    t = np.random.default_rng(0).permutation(np.concatenate([times[0] - [2.0, 0.5], inside, times[-1] + [0.5, 3.0]]))
+    for left in (False, True):
+        jet = plan.jet(t, 2, left=left)
+        within = (t > times[0]) & (t < times[-1])
+        np.testing.assert_array_equal(jet[:, :, within], plan.jet(t[within], 2, left=left))
+        held = np.where(t[~within] < times[0], values[:, :1], values[:, -1:])
+        np.testing.assert_array_equal(jet[0][:, ~within], held)
+        assert not jet[1:][:, :, ~within].any()
+
+
+def test_combined_plans_of_many_segments_are_combinations_of_their_jets():
+    times, values = data(60, 2)
+    plan, other = (PiecewiseSpline.from_arrays(times, y, derivatives=at_rest(60, 2)) for y in (values, values[::-1]))
+    t = np.sort(np.append(np.linspace(times[0] - 1.0, times[-1] + 1.0, 300), times))
+    for left in (False, True):
+        one, two = plan.jet(t, 3, left=left), other.jet(t, 3, left=left)
+        np.testing.assert_array_equal(plan.select(["y2"]).jet(t, 3, left=left), one[:, 1:])
+        np.testing.assert_array_equal((plan + other).jet(t, 3, left=left), one + two)
+        np.testing.assert_array_equal((2.5 * plan).jet(t, 3, left=left), 2.5 * one)
 
 
 def test_a_closed_plan_is_saved_and_retimed(tmp_path):
