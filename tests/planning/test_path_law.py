@@ -252,6 +252,10 @@ def test_limits_that_do_not_bound_the_speed_are_rejected():
         ({"y": (-1.0, 2.0)}, "limits must include one that a shorter plan would violate, got none"),
         ({"y_d1": cp.Limits(-1.0, 1.0, during=(0.3, 0.4))}, "limits must bound the speed along the whole path"),
         ({"y_d1": 1.0, "y_d2": (0.0, 1.0)}, 'limits of y_d2 must allow both signs with hold="path", got from 0 to 1'),
+        (
+            {"y_d1": cp.Limits(-1.0, lambda t: np.where(t < 0.5, 1.0, -0.5))},
+            "limits of y_d1 must include 0, the value at rest, got from -1 to -0.5",
+        ),
         ({"velocity": 0.0}, "limits of velocity must be finite and above 0"),
         ({"acceleration": np.nan}, "limits of acceleration must be finite and above 0"),
         ({"y_d1": (2.0, -2.0)}, "limits of y_d1 must increase, got 2 and -2"),

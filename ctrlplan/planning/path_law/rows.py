@@ -97,10 +97,12 @@ class Activity:
         for bound in bounds:
             low, high = bound.sides(times)
             if bound.order == 1:
-                with np.errstate(divide="ignore", invalid="ignore"):
+                with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                     share = first[bound.axis] / np.where(first[bound.axis] > 0.0, high, low)
+                _check_direction(bound, share, times)
                 # A limit of 0 applies to a direction in which the plan does not move, up to rounding.
-                speeds = np.maximum(speeds, np.where(np.isfinite(share), share, 0.0) ** 2)
+                with np.errstate(over="ignore"):
+                    speeds = np.maximum(speeds, np.where(np.isfinite(share), share, 0.0) ** 2)
             elif bound.order == 2:
                 low, high = np.where(np.isinf(low), -_FAR * high, low), np.where(np.isinf(high), -_FAR * low, high)
                 half = 0.5 * (high - low)
@@ -171,3 +173,14 @@ class Activity:
         for first, second, third in self.jerks:
             found = np.maximum(found, (third * b + 1.5 * second * slope + 0.5 * first * bend) * np.sqrt(b))
         return found
+
+
+def _check_direction(bound: Bound, shares: Array, times: Array) -> None:
+    """Raise for velocities, relative to their limits, of a sign that these do not allow."""
+    if (shares < 0.0).any():
+        time = float(times[shares < 0.0][0])
+        low, high = (float(side[0]) for side in bound.sides(np.array([time])))
+        raise ValueError(
+            f"limits of {bound.name} must include 0, the value at rest, got from {low:.6g} to {high:.6g} at "
+            f"{time:.6g} s"
+        )

@@ -80,7 +80,7 @@ HIGHEST = 5
 """Highest derivative of the plan on which signals may depend: the law has four continuous ones, the fifth jumps."""
 
 
-def fast_law_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Trajectory | None:
+def fast_law_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Retimed | None:
     """Plan with a fast time law; limits may be slightly violated between points of the cells.
 
     Parameters
@@ -94,7 +94,7 @@ def fast_law_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Tr
 
     Returns
     -------
-    Trajectory, or None
+    Retimed, or None
         None if no multiple of the plan's rate satisfies the limits, or every one, or if
         no other rate makes it shorter.
     """
