@@ -128,10 +128,13 @@ class Block:
         sample, own = self.traits.sample, {**self.params, **params}
         inner = self.held
         if inner is not None:
-            count, given = inner.nstates or 0, None if isinstance(inner, ct.StateSpace) else own
+            count = inner.nstates or 0
+            if isinstance(inner, ct.StateSpace):
+                a, b, c, d = (np.asarray(matrix, dtype=float) for matrix in (inner.A, inner.B, inner.C, inner.D))
+                return lambda t, x, u: c @ x[:count] + d @ u, lambda t, x, u: a @ x[:count] + b @ u
             return (
-                lambda t, x, u: np.ravel(inner.output(t, x[:count], u, given)),
-                lambda t, x, u: np.ravel(inner.dynamics(t, x[:count], u, given)) if count else np.empty(0),
+                lambda t, x, u: np.ravel(inner.output(t, x[:count], u, own)),
+                lambda t, x, u: np.ravel(inner.dynamics(t, x[:count], u, own)) if count else np.empty(0),
             )
         if sample is None:
             raise TypeError(f"block {self.name} must declare sample, the function evaluated at its sample times")

@@ -100,7 +100,7 @@ def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     attempt = Attempt(job, method, scales)
     attempt.go()
     for _ in range(PASSES - 1 if job.atol is None else 0):
-        found = scales.renewed(attempt.run.states, attempt.noise)
+        found = scales.renewed(attempt.run.states, attempt.moving, attempt.noise)
         if found is None:
             break
         following = Attempt(fresh, method, found)
@@ -379,7 +379,8 @@ def _accuracy_note(attempt: Attempt[S]) -> str:
     t, x, time_values = attempt.visited()
     if not x.size or not np.isfinite(x).all():
         return ""
-    own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
+    known = scales.with_sampled(run.states, attempt.moving)
+    own = known.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
     uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
     worst, ranges = output_uncertainty(
         lambda near: attempt.on_trial(solver.outputs, t, near, time_values, (count, -1)), x, uncertainty, attempt.moving

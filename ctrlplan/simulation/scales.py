@@ -101,7 +101,7 @@ class Scales:
         ones = np.ones(nstates)
         return cls(np.zeros(nstates), ones, RELATIVE if atol is None else atol, ones, np.zeros(nstates, dtype=bool))
 
-    def renewed(self, states: Array, noise: Callable[[], Array]) -> Scales | None:
+    def renewed(self, states: Array, moving: NDArray[np.intp], noise: Callable[[], Array]) -> Scales | None:
         """Scales for the states of a run; None if the present ones are adequate.
 
         A state below the tolerances of two runs, although that of the second was set
@@ -111,6 +111,8 @@ class Scales:
         ----------
         states : ndarray, shape (nstates, ntime)
             States of the run, from its start.
+        moving : ndarray of int
+            States that are integrated; the scales of others do not matter.
         noise : callable
             Returns the rounding error of each derivative times the duration, shape
             (nstates,): a lower bound of the tolerances.
@@ -118,7 +120,7 @@ class Scales:
         moved = np.abs(states - states[:, :1]).max(axis=1, initial=0.0)
         size = np.abs(states).max(axis=1, initial=0.0)
         unresolved = moved < self.atol * self.scale
-        real = (moved > 0.0) & ~(unresolved & self.unresolved)
+        real = (moved > 0.0) & ~(unresolved & self.unresolved) & np.isin(np.arange(len(states)), moving)
         small = real & (moved < _SMALL * self.scale)
         about = real & (moved < _OFFSET * size) & (self.shift == 0.0)
         if not (small | about).any():
@@ -131,6 +133,12 @@ class Scales:
             return None
         scale = np.minimum(scale, np.where(small, self.scale, np.inf))
         return replace(self, shift=shift, scale=scale, unresolved=unresolved)
+
+    def with_sampled(self, states: Array, moving: NDArray[np.intp]) -> Scales:
+        """Scales in which those of states that are not integrated are their displacements in a run."""
+        scale = np.abs(states - states[:, :1]).max(axis=1, initial=0.0)
+        scale[moving] = self.scale[moving]
+        return replace(self, scale=scale)
 
     def perturbed(self, states: Array, rtol: Array | float, atol: float) -> Array:
         """States (nstates, ntime) moved by the tolerance of a step, up and down in turn."""
