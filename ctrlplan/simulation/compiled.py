@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import re
-import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from enum import Enum
-from types import FrameType
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -18,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.simulation.interpreted import SolverError
+from ctrlplan.simulation.interruptions import passing_interruptions
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.scales import Scales, Tolerances
 from ctrlplan.simulation.signals import Series, within
@@ -54,9 +52,6 @@ integrated to each time from the start of the segment."""
 
 _EDGE = 100.0
 """Neighbourhood of a state, in tolerances of a step, in which the equations must be defined."""
-
-_SIGNALS = tuple(map(int, signal.valid_signals()))
-"""Numbers of the signals that can have handlers."""
 
 
 class Kind(Enum):
@@ -228,7 +223,7 @@ class Compiled:
             "disable_internal_warnings": True,
         }
         grid = np.frombuffer(settings.grid).tolist()
-        with _passing_interruptions(_handled()):
+        with passing_interruptions():
             made = ca.integrator("segment", "cvodes", self._segment_equations(settings.width), 0.0, grid, options)
         return Segment(made, self.moving.size)
 
@@ -261,7 +256,7 @@ class Compiled:
             self._equations[width] = {
                 "t": s,
                 "x": z,
-                "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), span, shift, scale, start),
+                "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), shift, scale, span, start),
                 "ode": length * self._rates(t, x, time_values, p)[moving] / scale,
             }
         return self._equations[width]
@@ -285,6 +280,10 @@ class Settings(NamedTuple):
     longest: float
 
 
+Arguments: TypeAlias = tuple[Array, Array, Sequence[float], Array]
+"""Arguments of `Segment.states`."""
+
+
 class Segment:
     """Integrator of a segment with memory for its arguments and results, for one thread."""
 
@@ -298,10 +297,19 @@ class Segment:
         self._buffer.set_arg(integrator.index_in("p"), self._p.data)
         self._buffer.set_res(integrator.index_out("xf"), self._found.data)
 
-    def states(self, start: Array, parameters: Sequence[ArrayLike]) -> Array:
-        """States (nstates, ntime), valid until the next call."""
+    def states(self, start: Array, known: Array, span: Sequence[float], held: Array) -> Array:
+        """States (nstates, ntime), valid until the next call.
+
+        Parameters
+        ----------
+        start : ndarray, shape (nstates,)
+            Scaled states at the start.
+        known, span, held : ndarray or sequence of float
+            Parameters, in this order: those that remain, the times of the segment, and all states at its start.
+        """
         self._start[:] = start
-        np.concatenate(parameters, out=self._p)
+        end = known.size + len(span)
+        self._p[: known.size], self._p[known.size : end], self._p[end:] = known, span, held
         self.is_running = True
         try:
             self._evaluate()
@@ -338,9 +346,12 @@ class CompiledSolver:
     ) -> None:
         self.form, self._p = equations, equations.parameters(params)
         self._scales, self._max_steps = scales, max_steps
+        self._shift, self._scale = scales.shift[self.moving], scales.scale[self.moving]
         self._tolerances = float(tolerances.rtol.min(initial=1.0)), tolerances.atol
         self._longest, self._kind, self._patterns = 0.0, Kind.ADAMS, 0
-        self._counts, self._handled = equations.compared.is_expected, _handled()
+        self._counts = equations.compared.is_expected
+        self._series: Series | None = None
+        self._known = np.empty(0)
         self.evaluations = 0
         self.switches: list[float] = []
 
@@ -406,15 +417,17 @@ class CompiledSolver:
             for k in range(grid.size):
                 out[:, k] = self.advance(series, left, grid[k : k + 1], state)[:, 0]
             return out
-        span = [left, right - left, series.left, series.right, *within(left, right, self.switches)]
-        shift, scale = self._scales.shift[moving], self._scales.scale[moving]
-        known = [self._p, series.coefficients.ravel(order="F"), series.low, series.high, span, shift, scale, state]
+        if series is not self._series:
+            parts = [self._p, series.coefficients.ravel(order="F"), series.low, series.high, self._shift, self._scale]
+            self._known, self._series = np.concatenate(parts), series
+        span = (left, right - left, series.left, series.right, *within(left, right, self.switches))
+        start = (state[moving] - self._shift) / self._scale
         try:
-            found = self._solved(settings, (state[moving] - shift) / scale, known, relative)
+            found = self._solved(settings, (start, self._known, span, state), relative)
         except _SegmentError as error:
             why = f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {error}"
             raise SolverError(why) from None
-        out[moving] = shift[:, None] + scale[:, None] * found
+        out[moving] = self._shift[:, None] + self._scale[:, None] * found
         return out
 
     def count(self) -> None:
@@ -435,23 +448,23 @@ class CompiledSolver:
         self._patterns += 1
         return self._patterns > _PATTERNS
 
-    def _solved(self, settings: Settings, start: Array, known: Sequence[ArrayLike], relative: Array) -> Array:
+    def _solved(self, settings: Settings, arguments: Arguments, relative: Array) -> Array:
         """Scaled states at the relative times; a diverging solution exhausts the steps."""
         try:
-            return self._tried(settings, start, known)
+            return self._tried(settings, arguments)
         except _SegmentError as error:
             if not error.too_long or settings.max_steps == self._max_steps:
                 raise
         # More steps, with closer outputs.
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
-        found = self._tried(settings._replace(grid=close.tobytes(), max_steps=self._max_steps), start, known)
+        found = self._tried(settings._replace(grid=close.tobytes(), max_steps=self._max_steps), arguments)
         return found[:, np.searchsorted(close, relative)]
 
-    def _tried(self, settings: Settings, start: Array, known: Sequence[ArrayLike]) -> Array:
+    def _tried(self, settings: Settings, arguments: Arguments) -> Array:
         integrator = self.form.integrator(settings)
         try:
-            with _passing_interruptions(self._handled):
-                found = integrator.states(start, known)
+            with passing_interruptions():
+                found = integrator.states(*arguments)
         except RuntimeError as error:
             code = re.search(r"CV_\w+", str(error))
             raise _SegmentError(code.group() if code else "") from None
@@ -469,54 +482,6 @@ class _SegmentError(Exception):
 
 
 _ONLY_END = np.ones(1)
-
-
-def _handled() -> tuple[int, ...]:
-    """Numbers of the signals with handlers in Python."""
-    return tuple(number for number in _SIGNALS if callable(signal.getsignal(number)))
-
-
-@contextmanager
-def _passing_interruptions(numbers: Iterable[int]) -> Iterator[None]:
-    """Propagate exceptions of the handlers of some signals to the caller, as on Ctrl-C.
-
-    CVODES treats an exception that a handler raises during a run as a failure of
-    the equations; one raised while a solver is constructed becomes a SystemError.
-    Handlers run in the main thread only; there they are wrapped and afterwards
-    restored.
-    """
-    raised: list[BaseException] = []
-    handlers: dict[int, Callable[[int, FrameType | None], object]] = {}
-    inside = False  # while handlers are exchanged, their exceptions are deferred
-
-    def accompanied(number: int, frame: FrameType | None) -> None:
-        try:
-            handlers[number](number, frame)
-        except BaseException as error:
-            raised.append(error)
-            if inside:
-                raise
-
-    try:
-        for number in numbers if threading.current_thread() is threading.main_thread() else ():
-            handler = signal.getsignal(number)
-            if callable(handler):
-                handlers[number] = handler
-                signal.signal(number, accompanied)
-        inside = True
-        if not raised:
-            yield
-    except (RuntimeError, SystemError):
-        if raised:
-            raise raised[0] from None
-        raise
-    finally:
-        inside = False
-        for key, handler in handlers.items():
-            if signal.getsignal(key) is accompanied:
-                signal.signal(key, handler)
-    if raised:
-        raise raised[0]
 
 
 def _called(function: ca.Function, arguments: Sequence[Array], nrows: int) -> Array:

@@ -492,9 +492,9 @@ class _Schedule:
 
     def on(self, times: Array, t: float) -> float:
         """Output time that equals a time up to rounding, so that its values are those after it."""
-        near = times[max(0, int(np.searchsorted(times, t)) - 1) :][:2]
-        close = near[np.abs(near - t) <= self._tolerance]
-        return float(close[0]) if close.size else t
+        k = int(times.searchsorted(t - self._tolerance))
+        near = float(times[k]) if k < times.size else math.inf
+        return near if abs(near - t) <= self._tolerance else t
 
     def sample(self, equations: Interpreted | None, t: float, x: Array) -> Array:
         """State after the samples of all blocks that are due at t."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
-from ctrlplan.simulation import compiled
+from ctrlplan.simulation import interruptions
 
 pytestmark = pytest.mark.skipif(
     not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread(),
@@ -81,7 +81,7 @@ def test_a_signal_while_handlers_are_exchanged_reaches_the_caller_and_leaves_the
     system = fast()
     cp.simulate(system, [0.0, 0.001], None, [1.0, 0.0], method="compiled")  # compiled before
     handler = alarm(KeyboardInterrupt)
-    monkeypatch.setattr(compiled, "_SIGNALS", Signals())
+    monkeypatch.setattr(interruptions, "_SIGNALS", Signals())
     with pytest.raises(KeyboardInterrupt):
         cp.simulate(system, [0.0, 0.001], None, [1.0, 0.0], method="compiled")
     assert signal.getsignal(signal.SIGALRM) is handler

@@ -11,6 +11,7 @@ import numpy as np
 from ctrlplan._types import Array
 from ctrlplan.simulation.built_forms import DisagreementError
 from ctrlplan.simulation.interpreted import SolverError
+from ctrlplan.simulation.interruptions import passing_interruptions
 from ctrlplan.simulation.job import Job, Record, fresh_job
 from ctrlplan.simulation.numerical import VISITED, Attempt, equations_of, numerical
 from ctrlplan.simulation.prepared import Prepared
@@ -52,10 +53,11 @@ class CompiledMethod:
             If a block cannot be traced at these parameters, or disagrees with Python.
         """
         fresh = fresh_job(job)
-        try:
-            return numerical(job, self)
-        except DisagreementError:  # an object used by a function may have changed since it was traced
-            return numerical(fresh, self)
+        with passing_interruptions():
+            try:
+                return numerical(job, self)
+            except DisagreementError:  # an object used by a function may have changed since it was traced
+                return numerical(fresh, self)
 
     def solver(self, attempt: Attempt[CompiledSolver]) -> CompiledSolver:
         """CVODES on the compiled form."""
