@@ -97,7 +97,9 @@ class Compiled:
         slopes = ca.jacobian(rates[moving], x)[:, moving] if moving else ca.SX(0, 0)
         self._jacobian = ca.Function("jacobian", [t, x, d, p], [ca.densify(slopes)])
         self._functions["jacobian"] = self._jacobian
-        w = _signals(network, traces, own, network.schedule(feeds, every), t, x, d)
+        steps = network.schedule(feeds, every)
+        self.has_loops = any(step.unknown is not None for step in steps)
+        w = _signals(network, traces, own, steps, t, x, d)
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
         self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(_sparse(network.read) @ w)])
         self._functions["switches"] = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]))
@@ -389,10 +391,8 @@ class CompiledSolver:
         """
         rtol, atol = self._tolerances
         reach = (rtol * np.abs(states) + (atol * self._scales.scale)[:, None]) * _EDGE
-        return not all(
-            np.isfinite(self.form.rates(times, near, time_values, self._p)).all()
-            for near in (states - reach, states, states + reach)
-        )
+        near = np.concatenate([states - reach, states, states + reach], axis=1)
+        return not np.isfinite(self.form.rates(np.tile(times, 3), near, np.tile(time_values, 3), self._p)).all()
 
     def instants(self, first: float, last: float, time_values: Callable[[Array], Array]) -> list[float]:
         """Times of a run at which the equations switch depending on functions of time only."""

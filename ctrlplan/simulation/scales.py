@@ -199,7 +199,7 @@ def output_uncertainty(
     Parameters
     ----------
     outputs : callable
-        Maps states (nstates, npoints) at some times to outputs (noutputs, npoints).
+        Maps states (nstates, n npoints), n times those at some times, to outputs (noutputs, n npoints).
     states : ndarray, shape (nstates, npoints)
         States at these times.
     uncertainty : ndarray, shape (nstates,)
@@ -208,18 +208,20 @@ def output_uncertainty(
         States whose effects are added; those of all others, the memories of
         sampled blocks, are found together.
     """
-    plain = outputs(states)
-    total = np.zeros(plain.shape)
     others = np.delete(np.arange(len(states)), moving)
+    groups, factors = [*moving[:, None], *([others] if others.size else [])], list[float]()
+    near = [states]
     with np.errstate(all="ignore"):
-        for rows in [*moving[:, None], *([others] if others.size else [])]:
+        for rows in groups:
             error = uncertainty[rows]
             # Steps large compared with rounding and small compared with the curvature of the outputs.
             large = 1e-7 * np.abs(states[rows]).max(axis=1, initial=0.0)
-            factor = float(np.max(large / error, initial=1.0, where=error > 0.0))
-            near = states.copy()
-            near[rows] += factor * error[:, None]
-            total += np.abs(outputs(near) - plain) / factor
+            factors.append(float(np.max(large / error, initial=1.0, where=error > 0.0)))
+            near.append(states.copy())
+            near[-1][rows] += factors[-1] * error[:, None]
+        plain, *found = np.split(outputs(np.concatenate(near, axis=1)), len(near), axis=1)
+        parts = [np.abs(displaced - plain) / factor for displaced, factor in zip(found, factors, strict=True)]
+        total = np.sum([np.zeros(plain.shape), *parts], axis=0)
     worst = np.where(np.isfinite(total), total, 0.0).max(axis=1, initial=0.0)
     return worst, np.ptp(plain, axis=1) if plain.shape[1] else np.zeros(len(plain))
 
