@@ -225,14 +225,20 @@ class Network:
 
     def for_trials(self) -> Network:
         """Same network for trial calls, with copies of blocks that have memory."""
-        remember = [not block.linear and can_remember(block.system) for block in self.blocks]
-        pairs = zip(self.blocks, remember, strict=True)
+        if not any(self.remember):
+            return self
+        pairs = zip(self.blocks, self.remember, strict=True)
         return replace(self, blocks=tuple(replace(b, system=trial_copy(b.system)) if r else b for b, r in pairs))
 
     def without_blocks(self) -> Network:
         """Network for runs of a compiled form, without functions that cannot be pickled."""
         watched = tuple(w for w in self.watched if _can_be_sent(w))
         return Network(self.name, (), self.wire[:0], self.read, self.ninputs, self.breakpoints, watched)
+
+    @cached_property
+    def remember(self) -> list[bool]:
+        """Whether each block may have memory in addition to its state."""
+        return [not block.linear and can_remember(block.system) for block in self.blocks]
 
     @cached_property
     def states(self) -> list[slice]:

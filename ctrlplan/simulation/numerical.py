@@ -22,7 +22,6 @@ from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, effects, outp
 from ctrlplan.simulation.segments import NetworkRun, Solver, integrate, known_before
 from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
 from ctrlplan.symbolic.isolation import untouched
-from ctrlplan.symbolic.trials import can_remember
 
 VISITED = 12
 """Number of visited states for checks, and for a comparison with Python without counted evaluations."""
@@ -182,6 +181,8 @@ class Attempt(Generic[S]):
         Growth of a perturbation of the initial state.
     time_signals : list of TimeSignal
         Inputs, then outputs of blocks that are functions of time.
+    copies : Network
+        Network for trial calls, with copies of blocks that have memory.
     """
 
     job: Job
@@ -192,6 +193,7 @@ class Attempt(Generic[S]):
     drift: Array | float = 0.0
     time_signals: list[TimeSignal] = field(init=False)
     watched: tuple[Watched, ...] = field(init=False)
+    copies: Network = field(init=False)
     solver: S = field(init=False)
     run: NetworkRun = field(init=False)
     _last: tuple[Array, Array] | None = field(init=False, default=None)
@@ -199,8 +201,7 @@ class Attempt(Generic[S]):
     def __post_init__(self) -> None:
         job = self.job
         self.time_signals, self.watched = job.prepared.time_signals(job.inputs, job.first), job.watched()
-        if any(can_remember(block.system) for block in job.blocks.blocks if not block.linear):
-            _ = self.copies  # with the memory that they have before the run
+        self.copies = job.blocks.for_trials()
         self.solver = self.method.solver(self)
 
     @cached_property
@@ -208,10 +209,6 @@ class Attempt(Generic[S]):
         """Equations evaluated by Python; None without blocks."""
         return equations_of(self.job, self.job.blocks)
 
-    @cached_property
-    def copies(self) -> Network:
-        """Network for trial calls, with copies of blocks that have memory."""
-        return self.job.blocks.for_trials()
 
     @property
     def stops(self) -> bool:
@@ -318,7 +315,14 @@ class Attempt(Generic[S]):
         said = _accuracy_note(self)
         reason = f"{self.job.reason}; {said}" if said else self.job.reason
         return Record(
-            self.run.times, self.run.states, self._snapshot, self._state_at, self.watched, self.method.name, reason
+            self.run.times,
+            self.run.states,
+            self._snapshot,
+            self._state_at,
+            self.watched,
+            self.method.name,
+            reason,
+            self._snapshot_inside,
         )
 
     def expands(self) -> bool:
@@ -360,10 +364,20 @@ class Attempt(Generic[S]):
         return self._last[1]
 
     def _snapshot(self, t: Array, x: Array) -> Snapshot:
-        time_values = self.time_values(t)
-        y = self.solver.outputs(t, x, time_values)
+        return self._seen(t, x, self.time_values(t))
+
+    def _snapshot_inside(self, t: Array, x: Array) -> Snapshot:
+        """Snapshot at one time, with the series of the functions of time."""
+        return self._seen(t, x, self.run.series(float(t[0]))(float(t[0]))[:, None])
+
+    def _seen(self, t: Array, x: Array, time_values: Array) -> Snapshot:
+        solver = self.solver
         return Snapshot(
-            t, x, time_values[: self.job.prepared.ninputs], y, lambda: self.solver.signals(t, x, time_values)
+            t,
+            x,
+            time_values[: self.job.prepared.ninputs],
+            lambda: solver.outputs(t, x, time_values),
+            lambda: solver.signals(t, x, time_values),
         )
 
     def _state_at(self, k: int, t: float) -> Array:
