@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple, TypeAlias
 
@@ -45,6 +46,9 @@ _FAILURES = {
 _STIFF, _SHORT = 3000.0, 0.5
 """Segment length in units of the fastest time constant above which BDF requires fewer steps than Adams; and, in units
 of the inverse norm of the Jacobian, below which each step is found by iteration without linear systems."""
+
+_KIND_KEPT = 32
+"""Number of segments after which the kind of integration is chosen again."""
 
 _PATTERNS, _APART = 16, 32
 """Number of patterns of output times for which a run builds integrators; further patterns of up to so many times are
@@ -350,7 +354,7 @@ class CompiledSolver:
         self._scales, self._max_steps = scales, max_steps
         self._shift, self._scale = scales.shift[self.moving], scales.scale[self.moving]
         self._tolerances = float(tolerances.rtol.min(initial=1.0)), tolerances.atol
-        self._longest, self._kind, self._patterns = 0.0, Kind.ADAMS, 0
+        self._longest, self._kind, self._segments, self._patterns = 0.0, Kind.ADAMS, 0, 0
         self._counts = equations.compared.is_expected
         self._series: Series | None = None
         self._known = np.empty(0)
@@ -406,9 +410,10 @@ class CompiledSolver:
         if not moving.size:
             return out
         right = float(grid[-1])
-        if right - left > self._longest:
-            self._longest = right - left
-            self._kind = self.form.kind(left, state, series(left), self._p, right - left)
+        if right - left > self._longest or self._segments % _KIND_KEPT == 0:
+            self._longest = max(self._longest, right - left)
+            self._kind = self.form.kind(left, state, series(left), self._p, self._longest)
+        self._segments += 1
         relative = _ONLY_END if grid.size == 1 else (grid - left) / (right - left)
         if 1 < grid.size <= _FEW:  # rounding errors of time must not require a new integrator for every short segment
             relative = np.round(relative, 12)
@@ -450,6 +455,10 @@ class CompiledSolver:
 
     def _solved(self, settings: Settings, arguments: Arguments, relative: Array) -> Array:
         """Scaled states at the relative times; a diverging solution exhausts the steps."""
+        if settings.kind is Kind.FIXED_POINT:
+            with suppress(_SegmentError):  # the equations may have become stiff
+                return self._tried(settings, arguments)
+            settings = settings._replace(kind=Kind.ADAMS)
         try:
             return self._tried(settings, arguments)
         except _SegmentError as error:
