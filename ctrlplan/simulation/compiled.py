@@ -218,7 +218,7 @@ class Compiled:
 
     def _made(self, settings: Settings) -> Segment:
         multistep, iteration = settings.kind.value
-        options = {
+        options: dict[str, Value] = {
             "linear_multistep_method": multistep,
             "nonlinear_solver_iteration": iteration,
             "reltol": settings.rtol,
@@ -325,7 +325,8 @@ class Segment:
 
     def evaluations(self) -> int:
         """Evaluations of the right-hand side in the last call."""
-        return int(getattr(self._buffer, "stats", dict)().get("nfevals", 0))
+        stats: dict[str, Value] = getattr(self._buffer, "stats", dict)()
+        return int(stats.get("nfevals", 0))
 
 
 class CompiledSolver:

@@ -209,7 +209,6 @@ class Attempt(Generic[S]):
         """Equations evaluated by Python; None without blocks."""
         return equations_of(self.job, self.job.blocks)
 
-
     @property
     def stops(self) -> bool:
         """Whether an event may end the run."""

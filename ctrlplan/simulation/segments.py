@@ -465,6 +465,8 @@ class _Schedule:
 
     def __init__(self, network: Network, time_signals: Sequence[TimeSignal], first: float, last: float) -> None:
         self._time_signals, self._arrivals = time_signals, list[float]()
+        self._ahead: tuple[Array, Array] = np.empty(0), np.empty((0, 0))
+        self._tolerance = time_tolerance(first, last)
         self.prolong([], first, last)
         check_periods([network.blocks[i] for i in network.blocks_with("period")], first, last)
         self.samples = SampleTimes(network, first)
