@@ -115,3 +115,21 @@ def test_runs_in_other_threads_leave_handlers_alone():
     thread.join()
     assert len(found) == 1
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_handler_that_simulates_the_same_system_does_not_change_the_run(alarm):
+    system, t, inner = fast(), np.linspace(0, 0.5, 3), []
+    before = signal.getsignal(signal.SIGALRM)
+    plain = cp.simulate(system, t, None, [1.0, 0.0], method="compiled")
+    signal.signal(
+        signal.SIGALRM,
+        lambda number, frame: inner.append(cp.simulate(system, t, None, [0.5, 0.0], method="compiled")),
+    )
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
+        found = cp.simulate(system, t, None, [1.0, 0.0], method="compiled")
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert np.array_equal(found.outputs, plain.outputs)
+    assert np.array_equal(inner[0].outputs, cp.simulate(system, t, None, [0.5, 0.0], method="compiled").outputs)
