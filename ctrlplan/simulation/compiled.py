@@ -50,7 +50,7 @@ of the inverse norm of the Jacobian, below which each step is found by iteration
 _KIND_KEPT = 32
 """Number of segments after which the kind of integration is chosen again."""
 
-_PATTERNS, _APART = 16, 32
+_PATTERNS, _APART = 16, 12
 """Number of patterns of output times for which a run builds integrators; further patterns of up to so many times are
 integrated to each time from the start of the segment."""
 
