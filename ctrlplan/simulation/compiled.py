@@ -448,7 +448,7 @@ class CompiledSolver:
         return Settings(width, relative.tobytes(), self._kind, *self._tolerances, allowed, longest)
 
     def _is_rare(self, settings: Settings, count: int) -> bool:
-        """Whether a pattern of some output times is not worth building an integrator."""
+        """Whether a pattern of some output times is integrated to each of them, without an integrator of its own."""
         if not 1 < count <= _APART or settings.longest or self.form.has_integrator(settings):
             return False
         self._patterns += 1

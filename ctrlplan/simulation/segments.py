@@ -506,7 +506,7 @@ class _Schedule:
         return equations.sampled(due, t, x, self._values(t))
 
     def _values(self, t: float) -> Array:
-        """Functions of time at a sample; for many samples at once, unless some are only known during the run."""
+        """Functions of time at a sample; for many samples together, unless some are only known during the run."""
         times, values = self._ahead
         k = int(times.searchsorted(t - self._tolerance))
         if k == times.size or times[k] > t + self._tolerance:
