@@ -35,6 +35,9 @@ class Lru(Generic[K, V]):
     def __reduce__(self) -> tuple[type[Lru[K, V]], tuple[int]]:
         return type(self), (self.size,)
 
+    def __contains__(self, key: K) -> bool:
+        return key in self._entries
+
     def get(self, key: K, make: Callable[[], V]) -> V:
         """Entry of a key, built if missing."""
         with BUILDING:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from enum import Enum
+from typing import NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.simulation.interpreted import SolverError
+from ctrlplan.simulation.interruptions import passing_interruptions
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.scales import Scales, Tolerances
 from ctrlplan.simulation.signals import Series, within
@@ -23,13 +24,10 @@ from ctrlplan.symbolic.comparison import Compared
 from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
 from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
-Stats = Mapping[str, float]
-"""Statistics of an integrator by name."""
-
 _CACHE_SIZE = 64
 """Number of cached integrators, one for each pattern of output times, and of cached functions of many times."""
 
-_DIGITS, _APART = 12, 1e-9
+_DIGITS, _NEAR = 12, 1e-9
 """Digits of output times in units of a segment, and their distance above which they are rounded to these digits."""
 
 _FEW_STEPS = 2_000
@@ -45,14 +43,27 @@ _FAILURES = {
     "CV_FIRST_RHSFUNC_ERR": "the derivatives of the states are not finite at its start",
 }
 
-_STIFF = 3000.0
-"""Segment length in units of the fastest time constant above which BDF requires fewer steps than Adams."""
+_STIFF, _SHORT = 3000.0, 0.5
+"""Segment length in units of the fastest time constant above which BDF requires fewer steps than Adams; and, in units
+of the inverse norm of the Jacobian, below which each step is found by iteration without linear systems."""
+
+_KIND_KEPT = 32
+"""Number of segments after which the kind of integration is chosen again."""
+
+_PATTERNS, _APART = 16, 12
+"""Number of patterns of output times for which a run builds integrators; further patterns of up to so many times are
+integrated to each time from the start of the segment."""
 
 _EDGE = 100.0
 """Neighbourhood of a state, in tolerances of a step, in which the equations must be defined."""
 
-_SIGNALS = tuple(map(int, signal.valid_signals()))
-"""Numbers of the signals that can have handlers."""
+
+class Kind(Enum):
+    """Kind of integration: options of CVODES."""
+
+    ADAMS = "adams", "newton"
+    BDF = "bdf", "newton"
+    FIXED_POINT = "adams", "functional"
 
 
 class Compiled:
@@ -90,7 +101,9 @@ class Compiled:
         slopes = ca.jacobian(rates[moving], x)[:, moving] if moving else ca.SX(0, 0)
         self._jacobian = ca.Function("jacobian", [t, x, d, p], [ca.densify(slopes)])
         self._functions["jacobian"] = self._jacobian
-        w = _signals(network, traces, own, network.schedule(feeds, every), t, x, d)
+        steps = network.schedule(feeds, every)
+        self.has_loops = any(step.unknown is not None for step in steps)
+        w = _signals(network, traces, own, steps, t, x, d)
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
         self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(_sparse(network.read) @ w)])
         self._functions["switches"] = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]))
@@ -102,7 +115,7 @@ class Compiled:
             trace is not None and block.changes_unseen and trace.depends_on_time()
             for block, trace in zip(network.blocks, traces, strict=True)
         )
-        self._integrators: Lru[tuple[object, ...], ca.Function] = Lru(_CACHE_SIZE)
+        self._integrators: Lru[tuple[object, ...], Segment] = Lru(_CACHE_SIZE)
         self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
         self._equations: dict[int, dict[str, ca.SX]] = {}
 
@@ -184,32 +197,41 @@ class Compiled:
                     return f"block {block.name} cannot be traced ({wrong})"
         return ""
 
-    def fastest_decay(self, t: float, x: Array, time_values: Array, p: Array) -> float:
-        """Largest decay rate [1/s] of the equations linearised at a state."""
+    def kind(self, t: float, x: Array, time_values: Array, p: Array, length: float) -> Kind:
+        """Kind of integration for a segment of given length, by the equations linearised at a state."""
         jacobian = _called(self._jacobian, (np.array([t]), x, time_values, p), self.moving.size)
-        return float(-np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else np.inf
+        if not np.isfinite(jacobian).all():
+            return Kind.BDF
+        if np.linalg.norm(jacobian) * length < _SHORT:
+            return Kind.FIXED_POINT
+        return Kind.BDF if -np.linalg.eigvals(jacobian).real.min() * length > _STIFF else Kind.ADAMS
 
-    def integrator(
-        self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int, longest: float
-    ) -> ca.Function:
+    def integrator(self, settings: Settings) -> Segment:
         """CVODES over a segment scaled to length 1, with outputs at given times."""
         # CasADi releases the global interpreter lock: each thread has its own integrators.
-        key = (threading.get_ident(), width, grid.tobytes(), stiff, rtol, atol, max_steps, longest)
+        found = self._integrators.get((threading.get_ident(), settings), lambda: self._made(settings))
+        return self._made(settings) if found.is_running else found  # a handler of a signal may simulate
 
-        def made() -> ca.Function:
-            options = {
-                "linear_multistep_method": "bdf" if stiff else "adams",
-                "reltol": rtol,
-                "abstol": atol,
-                "max_num_steps": max_steps,
-                "max_step_size": longest,
-                "show_eval_warnings": False,
-                "disable_internal_warnings": True,
-            }
-            with _passing_interruptions():
-                return ca.integrator("segment", "cvodes", self._segment_equations(width), 0.0, grid.tolist(), options)
+    def has_integrator(self, settings: Settings) -> bool:
+        """Whether an integrator has been built."""
+        return (threading.get_ident(), settings) in self._integrators
 
-        return self._integrators.get(key, made)
+    def _made(self, settings: Settings) -> Segment:
+        multistep, iteration = settings.kind.value
+        options: dict[str, Value] = {
+            "linear_multistep_method": multistep,
+            "nonlinear_solver_iteration": iteration,
+            "reltol": settings.rtol,
+            "abstol": settings.atol,
+            "max_num_steps": settings.max_steps,
+            "max_step_size": settings.longest,
+            "show_eval_warnings": False,
+            "disable_internal_warnings": True,
+        }
+        grid = np.frombuffer(settings.grid).tolist()
+        with passing_interruptions():
+            made = ca.integrator("segment", "cvodes", self._segment_equations(settings.width), 0.0, grid, options)
+        return Segment(made, self.moving.size)
 
     def _at_many(self, name: str, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         function = self._functions[name]
@@ -240,7 +262,7 @@ class Compiled:
             self._equations[width] = {
                 "t": s,
                 "x": z,
-                "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), span, shift, scale, start),
+                "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), shift, scale, span, start),
                 "ode": length * self._rates(t, x, time_values, p)[moving] / scale,
             }
         return self._equations[width]
@@ -250,6 +272,61 @@ class Compiled:
         return [
             ca.vertcat(*[p[k] for k, (j, _) in enumerate(self._places) if j == i]) for i in range(len(self._traces))
         ]
+
+
+class Settings(NamedTuple):
+    """What an integrator of a segment is built for: terms of the series, output times (bytes), CVODES."""
+
+    width: int
+    grid: bytes
+    kind: Kind
+    rtol: float
+    atol: float
+    max_steps: int
+    longest: float
+
+
+Arguments: TypeAlias = tuple[Array, Array, Sequence[float], Array]
+"""Arguments of `Segment.states`."""
+
+
+class Segment:
+    """Integrator of a segment with memory for its arguments and results, for one thread."""
+
+    def __init__(self, integrator: ca.Function, nstates: int) -> None:
+        self._start, self._p = np.empty(nstates), np.empty(integrator.numel_in("p"))
+        self._found = np.empty((integrator.numel_out("xf") // nstates, nstates))
+        given: tuple[Value, Callable[[], None]] = integrator.buffer()  # not in the type stubs of CasADi
+        self._buffer, self._evaluate = given
+        self.is_running = False
+        self._buffer.set_arg(integrator.index_in("x0"), self._start.data)
+        self._buffer.set_arg(integrator.index_in("p"), self._p.data)
+        self._buffer.set_res(integrator.index_out("xf"), self._found.data)
+
+    def states(self, start: Array, known: Array, span: Sequence[float], held: Array) -> Array:
+        """States (nstates, ntime), valid until the next call.
+
+        Parameters
+        ----------
+        start : ndarray, shape (nstates,)
+            Scaled states at the start.
+        known, span, held : ndarray or sequence of float
+            Parameters, in this order: those that remain, the times of the segment, and all states at its start.
+        """
+        self._start[:] = start
+        end = known.size + len(span)
+        self._p[: known.size], self._p[known.size : end], self._p[end:] = known, span, held
+        self.is_running = True
+        try:
+            self._evaluate()
+        finally:
+            self.is_running = False
+        return self._found.T
+
+    def evaluations(self) -> int:
+        """Evaluations of the right-hand side in the last call."""
+        stats: dict[str, Value] = getattr(self._buffer, "stats", dict)()
+        return int(stats.get("nfevals", 0))
 
 
 class CompiledSolver:
@@ -276,11 +353,14 @@ class CompiledSolver:
     ) -> None:
         self.form, self._p = equations, equations.parameters(params)
         self._scales, self._max_steps = scales, max_steps
+        self._shift, self._scale = scales.shift[self.moving], scales.scale[self.moving]
         self._tolerances = float(tolerances.rtol.min(initial=1.0)), tolerances.atol
-        self._longest, self._stiff = 0.0, False
+        self._longest, self._kind, self._segments, self._patterns = 0.0, Kind.ADAMS, 0, 0
+        self._counts = equations.compared.is_expected
+        self._series: Series | None = None
+        self._known = np.empty(0)
         self.evaluations = 0
         self.switches: list[float] = []
-        self._report = self._count if equations.compared.is_expected else None
 
     @property
     def moving(self) -> NDArray[np.intp]:
@@ -316,10 +396,8 @@ class CompiledSolver:
         """
         rtol, atol = self._tolerances
         reach = (rtol * np.abs(states) + (atol * self._scales.scale)[:, None]) * _EDGE
-        return not all(
-            np.isfinite(self.form.rates(times, near, time_values, self._p)).all()
-            for near in (states - reach, states, states + reach)
-        )
+        near = np.concatenate([states - reach, states, states + reach], axis=1)
+        return not np.isfinite(self.form.rates(np.tile(times, 3), near, np.tile(time_values, 3), self._p)).all()
 
     def instants(self, first: float, last: float, time_values: Callable[[Array], Array]) -> list[float]:
         """Times of a run at which the equations switch depending on functions of time only."""
@@ -328,94 +406,93 @@ class CompiledSolver:
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment; the last is its end."""
         moving = self.form.moving
-        out = np.repeat(state[:, None], grid.size, axis=1)
+        out = np.empty((state.size, grid.size))
+        out[:] = state[:, None]
         if not moving.size:
             return out
         right = float(grid[-1])
-        relative = _pattern((grid - left) / (right - left))
-        if right - left > self._longest:
-            decay = self.form.fastest_decay(left, state, series(left), self._p)
-            self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
-        width = series.coefficients.shape[1]
-        span = [left, right - left, series.left, series.right, *within(left, right, self.switches)]
-        shift, scale, max_steps = self._scales.shift[moving], self._scales.scale[moving], self._max_steps
-        known = [series.coefficients.ravel(order="F"), series.low, series.high, span, shift, scale, state]
-        p = np.concatenate([self._p, *known])
-        start = (state[moving] - shift) / scale
-        # Equations that depend on time are evaluated at least once per sample, so that no pulse is skipped.
-        longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self.form.depends_on_time else 0.0
-        # A diverging solution exhausts the steps: few in the first attempt, then more, with closer outputs.
-        close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
-        for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
-            settings = width, outputs, self._stiff, *self._tolerances, allowed, longest
-            integrator = self.form.integrator(*settings)
-            try:
-                with _passing_interruptions():
-                    found = _called(integrator, (start, np.empty(0), p), moving.size, self._report)
-                out[moving] = shift[:, None] + scale[:, None] * found[:, np.searchsorted(outputs, relative)]
-                return out
-            except RuntimeError as error:
-                code = re.search(r"CV_\w+", str(error))
-                flag = code.group() if code else ""
-                why = _FAILURES.get(flag, "the equations could not be evaluated")
-                if flag != "CV_TOO_MUCH_WORK" or allowed == max_steps:
-                    break
-        raise SolverError(f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {why}")
+        if right - left > self._longest or self._segments % _KIND_KEPT == 0:
+            self._longest = max(self._longest, right - left)
+            self._kind = self.form.kind(left, state, series(left), self._p, self._longest)
+        self._segments += 1
+        relative = _ONLY_END if grid.size == 1 else _pattern((grid - left) / (right - left))
+        settings = self._settings(series, relative)
+        if self._is_rare(settings, grid.size):
+            for k in range(grid.size):
+                out[:, k] = self.advance(series, left, grid[k : k + 1], state)[:, 0]
+            return out
+        if series is not self._series:
+            parts = [self._p, series.coefficients.ravel(order="F"), series.low, series.high, self._shift, self._scale]
+            self._known, self._series = np.concatenate(parts), series
+        span = (left, right - left, series.left, series.right, *within(left, right, self.switches))
+        start = (state[moving] - self._shift) / self._scale
+        try:
+            found = self._solved(settings, (start, self._known, span, state), relative)
+        except _SegmentError as error:
+            why = f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {error}"
+            raise SolverError(why) from None
+        out[moving] = self._shift[:, None] + self._scale[:, None] * found
+        return out
 
     def count(self) -> None:
         """Start counting evaluations."""
-        self._report = self._count
+        self._counts = True
 
-    def _count(self, stats: Stats) -> None:
-        self.evaluations += int(stats.get("nfevals", 0))
+    def _settings(self, series: Series, relative: Array) -> Settings:
+        # Equations that depend on time are evaluated at least once per sample, so that no pulse is skipped.
+        longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self.form.depends_on_time else 0.0
+        allowed = min(_FEW_STEPS, self._max_steps)
+        width = series.coefficients.shape[1]
+        return Settings(width, relative.tobytes(), self._kind, *self._tolerances, allowed, longest)
 
+    def _is_rare(self, settings: Settings, count: int) -> bool:
+        """Whether a pattern of some output times is integrated to each of them, without an integrator of its own."""
+        if not 1 < count <= _APART or settings.longest or self.form.has_integrator(settings):
+            return False
+        self._patterns += 1
+        return self._patterns > _PATTERNS
 
-@contextmanager
-def _passing_interruptions() -> Iterator[None]:
-    """Propagate exceptions of signal handlers to the caller, as on Ctrl-C.
-
-    CVODES treats an exception that a handler raises during a run as a failure of
-    the equations; one raised while a solver is constructed becomes a SystemError.
-    Handlers run in the main thread only; there they are wrapped and afterwards
-    restored.
-    """
-    raised: list[BaseException] = []
-    handlers: dict[int, Callable[[int, FrameType | None], object]] = {}
-    inside = False  # while handlers are exchanged, their exceptions are deferred
-
-    def accompanied(number: int, frame: FrameType | None) -> None:
+    def _solved(self, settings: Settings, arguments: Arguments, relative: Array) -> Array:
+        """Scaled states at the relative times; a diverging solution exhausts the steps."""
+        if settings.kind is Kind.FIXED_POINT:
+            with suppress(_SegmentError):  # the equations may have become stiff
+                return self._tried(settings, arguments)
+            settings = settings._replace(kind=Kind.ADAMS)
         try:
-            handlers[number](number, frame)
-        except BaseException as error:
-            raised.append(error)
-            if inside:
+            return self._tried(settings, arguments)
+        except _SegmentError as error:
+            if not error.too_long or settings.max_steps == self._max_steps:
                 raise
+        # More steps, with closer outputs.
+        close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
+        found = self._tried(settings._replace(grid=close.tobytes(), max_steps=self._max_steps), arguments)
+        return found[:, np.searchsorted(close, relative)]
 
-    try:
-        for number in _SIGNALS if threading.current_thread() is threading.main_thread() else ():
-            handler = signal.getsignal(number)
-            if callable(handler):
-                handlers[number] = handler
-                signal.signal(number, accompanied)
-        inside = True
-        if not raised:
-            yield
-    except (RuntimeError, SystemError):
-        if raised:
-            raise raised[0] from None
-        raise
-    finally:
-        inside = False
-        for key, handler in handlers.items():
-            if signal.getsignal(key) is accompanied:
-                signal.signal(key, handler)
-    if raised:
-        raise raised[0]
+    def _tried(self, settings: Settings, arguments: Arguments) -> Array:
+        integrator = self.form.integrator(settings)
+        try:
+            with passing_interruptions():
+                found = integrator.states(*arguments)
+        except RuntimeError as error:
+            code = re.search(r"CV_\w+", str(error))
+            raise _SegmentError(code.group() if code else "") from None
+        if self._counts:
+            self.evaluations += integrator.evaluations()
+        return found
 
 
-def _called(
-    function: ca.Function, arguments: Sequence[Array], nrows: int, report: Callable[[Stats], None] | None = None
-) -> Array:
+class _SegmentError(Exception):
+    """CVODES failed over a segment."""
+
+    def __init__(self, flag: str) -> None:
+        super().__init__(_FAILURES.get(flag, "the equations could not be evaluated"))
+        self.too_long = flag == "CV_TOO_MUCH_WORK"
+
+
+_ONLY_END = np.ones(1)
+
+
+def _called(function: ca.Function, arguments: Sequence[Array], nrows: int) -> Array:
     """First result (nrows, n) of a function, without conversion through CasADi matrices."""
     out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
     given: tuple[Value, Callable[[], None]] = function.buffer()  # not in the type stubs of CasADi
@@ -426,15 +503,13 @@ def _called(
             buffer.set_arg(k, values.data)
     buffer.set_res(0, out.data)
     evaluate()
-    if report is not None:
-        report(getattr(buffer, "stats", dict)())
     return out.T
 
 
 def _pattern(relative: Array) -> Array:
     """Relative output times of a segment; rounded, as rounding errors of time must not require a new integrator."""
     rounded = np.round(relative, _DIGITS)
-    return rounded if relative.size == 1 or np.diff(rounded).min() > _APART else relative
+    return rounded if np.diff(rounded).min() > _NEAR else relative
 
 
 def _feedthrough(block: Block, trace: Trace | None) -> NDArray[np.bool_]:

@@ -112,13 +112,18 @@ def what_happened(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """Times, states, inputs and outputs of a run, time last; all signals of a network on demand."""
+    """Times, states and inputs of a run, time last; its outputs, and all signals of a network, on demand."""
 
     t: Array
     x: Array
     u: Array
-    y: Array
+    outputs: Callable[[], Array]
     signals: Callable[[], Array] | None = None
+
+    @cached_property
+    def y(self) -> Array:
+        """Outputs, (noutputs, ntime)."""
+        return self.outputs()
 
     @cached_property
     def w(self) -> Array:

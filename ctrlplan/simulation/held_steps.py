@@ -530,7 +530,8 @@ class ScaledSolver:
                 with np.errstate(all="ignore"):
                     return float(grid[-1] - left) * rounding_of(lambda x: rates(grid, x, series.at(grid)), found)
 
-            renewed = self._scales.renewed(seen, noise, np.zeros_like)  # a step is too short to pass errors on
+            # A step is too short to pass errors on.
+            renewed = self._scales.renewed(seen, self._solver.moving, noise, np.zeros_like)
             self._seen[:, 1:] = np.stack([seen.min(axis=1), seen.max(axis=1)], axis=1)
             if renewed is None:
                 break
@@ -567,6 +568,10 @@ class HeldSignal:
         return self.at(s)
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
+        """The value itself."""
+        return self.value, self.value
+
+    def ends(self, left: float, right: float) -> tuple[Array, Array]:
         """The value itself."""
         return self.value, self.value
 

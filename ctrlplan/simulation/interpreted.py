@@ -7,12 +7,11 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from types import TracebackType
 from typing import NoReturn
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import BDF, LSODA, RK45, OdeSolver
 from scipy.linalg import block_diag
 
@@ -97,7 +96,8 @@ class Interpreted:
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
         self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
         self._for_samples: dict[tuple[int, ...], list[Call]] = {}
-        self._a, self._b, self._linear_states, self._linear_columns, self._moving = _merged_linear(network)
+        self._a, self._b, self._linear_states, self._linear_columns, others = _merged_linear(network)
+        self._moving = [(i, self._updates[i], network.states[i], network.fed[i]) for i in others]
 
     def rates(self, t: float, x: Array, time_values: Array) -> Array:
         """Derivatives of all states, from the values of the functions of time."""
@@ -110,10 +110,12 @@ class Interpreted:
         """The same from all signals; for a discrete system the next states."""
         dx = np.zeros(x.size)
         dx[self._linear_states] = self._a @ x[self._linear_states] + self._b @ w[self._linear_columns]
-        for i in self._moving:
-            place = self.network.states[i]
-            with _named(self.network.blocks[i].name, t):
-                found = np.ravel(self._updates[i](t, x[place], self.network.fed[i](w)))
+        for i, update, place, fed in self._moving:
+            try:
+                found = _row(update(t, x[place], fed(w)))
+            except BaseException as error:
+                _locate(error, self.network.blocks[i].name, t)
+                raise
             if found.size != place.stop - place.start:
                 raise ValueError(
                     f"block {self.network.blocks[i].name} must return the derivatives of "
@@ -150,8 +152,11 @@ class Interpreted:
         network, after = self.network, x.copy()
         for i in blocks:
             place = network.states[i]
-            with _named(network.blocks[i].name, t):
+            try:
                 following = self._samples[i][1](t, x[place], network.fed[i](w))
+            except BaseException as error:
+                _locate(error, network.blocks[i].name, t)
+                raise
             if network.blocks[i].held is not None:  # the held outputs are among the signals
                 following = np.concatenate([following, w[network.outputs[i]]])
             after[place] = following
@@ -275,8 +280,11 @@ class Interpreted:
             return linear
 
         def call(t: float, x: Array, w: Array) -> None:
-            with _named(block.name, t):
-                found = np.ravel(output(t, x[states], fed(w)))
+            try:
+                found = _row(output(t, x[states], fed(w)))
+            except BaseException as error:
+                _locate(error, block.name, t)
+                raise
             if found.size != count:
                 raise ValueError(f"block {block.name} must return {count} outputs, got {found.size}")
             w[outs] = found
@@ -293,6 +301,7 @@ class InterpretedSolver:
         self._equations, self._scales = equations, scales
         self._rtol, self._atol = np.maximum(tolerances.rtol, _MIN_RTOL), tolerances.atol
         self._moving = equations.network.moving
+        self._shift, self._scale = scales.shift[self._moving], scales.scale[self._moving]
         self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
         self._segments, self._next = 0, 0
         self.switches: list[float] = []
@@ -313,12 +322,12 @@ class InterpretedSolver:
     def scaled_rates(self, t: float, z: Array, time_values: Array, start: Array) -> Array:
         """Derivatives of the scaled integrated states; the others are those at the start of the segment."""
         found = self._equations.rates(t, self.states_of(z, start), time_values)
-        return np.asarray(found[self._moving] / self._scales.scale[self._moving])
+        return np.asarray(found[self._moving] / self._scale)
 
     def states_of(self, z: Array, start: Array) -> Array:
         """All states for scaled integrated states."""
-        scales, x = self._scales, start.copy()
-        x[self._moving] = scales.shift[self._moving] + scales.scale[self._moving] * z
+        x = start.copy()
+        x[self._moving] = self._shift + self._scale * z
         return x
 
     def perturbed(self, states: Array) -> Array:
@@ -458,22 +467,14 @@ def _implicit() -> Iterator[type[OdeSolver]]:
         yield BDF
 
 
-class _named:  # noqa: N801 (a context, of which a run opens thousands)
-    """Context that adds block and time to an error."""
+def _row(values: ArrayLike) -> Array:
+    """Values (n,) that a block returns."""
+    return values if type(values) is np.ndarray and values.ndim == 1 else np.ravel(values)
 
-    __slots__ = ("_name", "_t")
 
-    def __init__(self, name: str, t: float) -> None:
-        self._name, self._t = name, t
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if error is not None:
-            error.add_note(f"in block {self._name} at {self._t:g} s")
+def _locate(error: BaseException, name: str, t: float) -> None:
+    """Add block and time to an error."""
+    error.add_note(f"in block {name} at {t:g} s")
 
 
 def _merged_linear(network: Network) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp], list[int]]:

@@ -110,6 +110,8 @@ class Record:
         Signals with limits that are events.
     method, reason : str
         Name of the method used, and why it was chosen.
+    inside : callable or None
+        The same as `snapshot` to rounding, faster at one time.
     """
 
     times: Array
@@ -119,6 +121,11 @@ class Record:
     watched: tuple[Watched, ...]
     method: str
     reason: str
+    inside: Callable[[Array, Array], Snapshot] | None = None
+
+    def snapshot_at(self, k: int, t: float) -> Snapshot:
+        """All signals at a time between times[k] and times[k + 1], for crossings of limits."""
+        return (self.inside or self.snapshot)(np.array([t]), self.state_at(k, t)[:, None])
 
     def state_at(self, k: int, t: float) -> Array:
         """State at a time between times[k] and times[k + 1]."""

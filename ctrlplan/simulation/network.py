@@ -130,10 +130,13 @@ class Block:
         sample, own = self.traits.sample, {**self.params, **params}
         inner = self.held
         if inner is not None:
-            count, given = inner.nstates or 0, None if isinstance(inner, ct.StateSpace) else own
+            count = inner.nstates or 0
+            if isinstance(inner, ct.StateSpace):
+                a, b, c, d = (np.asarray(matrix, dtype=float) for matrix in (inner.A, inner.B, inner.C, inner.D))
+                return lambda t, x, u: c @ x[:count] + d @ u, lambda t, x, u: a @ x[:count] + b @ u
             return (
-                lambda t, x, u: np.ravel(inner.output(t, x[:count], u, given)),
-                lambda t, x, u: np.ravel(inner.dynamics(t, x[:count], u, given)) if count else np.empty(0),
+                lambda t, x, u: np.ravel(inner.output(t, x[:count], u, own)),
+                lambda t, x, u: np.ravel(inner.dynamics(t, x[:count], u, own)) if count else np.empty(0),
             )
         if sample is None:
             raise TypeError(f"block {self.name} must declare sample, the function evaluated at its sample times")
@@ -224,14 +227,20 @@ class Network:
 
     def for_trials(self) -> Network:
         """Same network for trial calls, with copies of blocks that have memory."""
-        remember = [not block.linear and can_remember(block.system) for block in self.blocks]
-        pairs = zip(self.blocks, remember, strict=True)
+        if not any(self.remember):
+            return self
+        pairs = zip(self.blocks, self.remember, strict=True)
         return replace(self, blocks=tuple(replace(b, system=trial_copy(b.system)) if r else b for b, r in pairs))
 
     def without_blocks(self) -> Network:
         """Network for runs of a compiled form, without functions that cannot be pickled."""
         watched = tuple(w for w in self.watched if _can_be_sent(w))
         return Network(self.name, (), self.wire[:0], self.read, self.ninputs, self.breakpoints, watched)
+
+    @cached_property
+    def remember(self) -> list[bool]:
+        """Whether each block may have memory in addition to its state."""
+        return [not block.linear and can_remember(block.system) for block in self.blocks]
 
     @cached_property
     def states(self) -> list[slice]:

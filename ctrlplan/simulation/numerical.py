@@ -100,7 +100,7 @@ def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     attempt = Attempt(job, method, scales)
     attempt.go()
     for _ in range(PASSES - 1 if job.atol is None else 0):
-        found = scales.renewed(attempt.run.states, attempt.noise, attempt.passed_on)
+        found = scales.renewed(attempt.run.states, attempt.moving, attempt.noise, attempt.passed_on)
         if found is None:
             break
         following = Attempt(fresh, method, found)
@@ -183,8 +183,6 @@ class Attempt(Generic[S]):
         Inputs, then outputs of blocks that are functions of time.
     copies : Network
         Network for trial calls, with copies of blocks that have memory.
-    equations : Interpreted or None
-        Equations evaluated by Python; None without blocks.
     """
 
     job: Job
@@ -195,16 +193,21 @@ class Attempt(Generic[S]):
     drift: Array | float = 0.0
     time_signals: list[TimeSignal] = field(init=False)
     watched: tuple[Watched, ...] = field(init=False)
-    equations: Interpreted | None = field(init=False)
     copies: Network = field(init=False)
     solver: S = field(init=False)
     run: NetworkRun = field(init=False)
+    _last: tuple[Array, Array] | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        job, network = self.job, self.job.blocks
+        job = self.job
         self.time_signals, self.watched = job.prepared.time_signals(job.inputs, job.first), job.watched()
-        self.equations, self.copies = equations_of(job, network), network.for_trials()
+        self.copies = job.blocks.for_trials()
         self.solver = self.method.solver(self)
+
+    @cached_property
+    def equations(self) -> Interpreted | None:
+        """Equations evaluated by Python; None without blocks."""
+        return equations_of(self.job, self.job.blocks)
 
     @property
     def stops(self) -> bool:
@@ -216,9 +219,10 @@ class Attempt(Generic[S]):
         job = self.job
         marks = self.solver.instants(job.first, float(job.times[-1]), lambda t: known_before(self.time_signals, t))
         self.solver.switches = sorted([*job.blocks.breakpoints, *marks])
+        by_python = job.blocks.blocks_with("period") or job.blocks.blocks_with("delay")
         self.run = integrate(
             job.blocks,
-            self.equations,
+            self.equations if by_python else None,
             self.solver,
             self.time_signals,
             with_event_times(job.times, self.watched, self._initial_slope),
@@ -241,7 +245,7 @@ class Attempt(Generic[S]):
         found = self.effects * error > allowed[:, None]
         if found.any() and self.job.blocks.blocks_with("period"):
             # Feedback through samples is not in the Jacobian: only strongly nonlinear dependence counts.
-            t, x, time_values = self.visited()
+            t, x, time_values = self.visited
             size, rates = np.abs(states - scales.shift[:, None]).max(axis=1), self.solver.rates(t, x, time_values)
             size, rates = size[moving], rates[moving]
             found &= np.abs(self._slopes[: t.size]).max(axis=0) * size > _STEEP * np.abs(rates).max(
@@ -263,7 +267,7 @@ class Attempt(Generic[S]):
     @cached_property
     def _slopes(self) -> Array:
         """Jacobians of the integrated states, (nplaces, nmoving, nmoving), first at the visited times."""
-        t, x, time_values = self.visited()
+        t, x, time_values = self.visited
         some = slice(None, None, VISITED // _DISPLACED)
         # At samples that are full turns of an angle apart, the slope of its sine is the same and may be 0.
         displaced = x[:, some] * (1.0 + _JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, x[:, some].shape))
@@ -310,12 +314,19 @@ class Attempt(Generic[S]):
         said = _accuracy_note(self)
         reason = f"{self.job.reason}; {said}" if said else self.job.reason
         return Record(
-            self.run.times, self.run.states, self._snapshot, self._state_at, self.watched, self.method.name, reason
+            self.run.times,
+            self.run.states,
+            self._snapshot,
+            self._state_at,
+            self.watched,
+            self.method.name,
+            reason,
+            self._snapshot_inside,
         )
 
     def expands(self) -> bool:
         """Whether neighbouring solutions may diverge, by the largest growth rate along the run."""
-        t = self.visited()[0]
+        t = self.visited[0]
         slopes = self._slopes[: t.size]
         if t.size < 2 or not slopes.size or not np.isfinite(slopes).all():
             return False
@@ -333,7 +344,7 @@ class Attempt(Generic[S]):
 
     def noise(self) -> Array:
         """Rounding errors of the derivatives along the run, times its duration."""
-        t, x, time_values = self.visited()
+        t, x, time_values = self.visited
         duration = float(self.run.times[-1] - self.run.times[0])
         shape = (len(x), -1)
         return duration * rounding_of(lambda near: self.on_trial(self.solver.rates, t, near, time_values, shape), x)
@@ -344,17 +355,34 @@ class Attempt(Generic[S]):
         found[self.moving] = self.effects @ errors[self.moving]
         return found
 
+    @cached_property
     def visited(self) -> tuple[Array, Array, Array]:
         """Some times and states of the run, and the values of the functions of time."""
         some = np.unique(np.linspace(0, self.run.times.size - 1, VISITED).astype(int))
         t = self.run.times[some]
         return t, self.run.states[:, some], signal_values(self.time_signals, t)
 
+    def time_values(self, t: Array) -> Array:
+        """Values (nsignals, ntime) of the functions of time; those of the last call if the times are the same."""
+        if self._last is None or not np.array_equal(t, self._last[0]):
+            self._last = t, signal_values(self.time_signals, t)
+        return self._last[1]
+
     def _snapshot(self, t: Array, x: Array) -> Snapshot:
-        time_values = signal_values(self.time_signals, t)
-        y = self.solver.outputs(t, x, time_values)
+        return self._seen(t, x, self.time_values(t))
+
+    def _snapshot_inside(self, t: Array, x: Array) -> Snapshot:
+        """Snapshot at one time, with the series of the functions of time."""
+        return self._seen(t, x, self.run.series(float(t[0]))(float(t[0]))[:, None])
+
+    def _seen(self, t: Array, x: Array, time_values: Array) -> Snapshot:
+        solver = self.solver
         return Snapshot(
-            t, x, time_values[: self.job.prepared.ninputs], y, lambda: self.solver.signals(t, x, time_values)
+            t,
+            x,
+            time_values[: self.job.prepared.ninputs],
+            lambda: solver.outputs(t, x, time_values),
+            lambda: solver.signals(t, x, time_values),
         )
 
     def _state_at(self, k: int, t: float) -> Array:
@@ -384,14 +412,19 @@ def equations_of(job: Job, network: Network) -> Interpreted | None:
 def _accuracy_note(attempt: Attempt[S]) -> str:
     """Note on uncertain outputs with the tolerance that suffices; empty if there are none."""
     job, run, solver, scales = attempt.job, attempt.run, attempt.solver, attempt.scales
-    t, x, time_values = attempt.visited()
+    t, x, time_values = attempt.visited
     if not x.size or not np.isfinite(x).all():
         return ""
-    own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
+    known = scales.with_sampled(run.states, attempt.moving)
+    own = known.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
     uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
-    worst, ranges = output_uncertainty(
-        lambda near: attempt.on_trial(solver.outputs, t, near, time_values, (count, -1)), x, uncertainty, attempt.moving
-    )
+
+    def outputs(near: Array) -> Array:
+        copies = near.shape[1] // t.size
+        places = np.tile(t, copies), near, np.tile(time_values, copies)
+        return attempt.on_trial(solver.outputs, *places, (count, -1))
+
+    worst, ranges = output_uncertainty(outputs, x, uncertainty, attempt.moving)
     allowed = max(_UNCERTAIN, 100.0 * job.rtol) * ranges
     uncertain = (ranges > 0.0) & (worst > allowed)
     if not uncertain.any():

@@ -116,6 +116,9 @@ class LateSignal:
         free = np.full(self.width, np.inf)
         return -free, free
 
+    def ends(self, left: float, right: float) -> None:
+        """None: the values are not known to be straight lines."""
+
 
 def moved_signals(
     form: SampledForm,

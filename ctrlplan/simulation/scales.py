@@ -104,7 +104,13 @@ class Scales:
         ones = np.ones(nstates)
         return cls(np.zeros(nstates), ones, RELATIVE if atol is None else atol, ones, np.zeros(nstates, dtype=bool))
 
-    def renewed(self, states: Array, noise: Callable[[], Array], passed_on: Callable[[Array], Array]) -> Scales | None:
+    def renewed(
+        self,
+        states: Array,
+        moving: NDArray[np.intp],
+        noise: Callable[[], Array],
+        passed_on: Callable[[Array], Array],
+    ) -> Scales | None:
         """Scales for the states of a run; None if the present ones are adequate.
 
         A state below the tolerances of two runs, although that of the second was set
@@ -114,6 +120,8 @@ class Scales:
         ----------
         states : ndarray, shape (nstates, ntime)
             States of the run, from its start.
+        moving : ndarray of int
+            States that are integrated; the scales of others do not matter.
         noise : callable
             Returns the rounding error of each derivative times the duration, shape
             (nstates,): a lower bound of the tolerances.
@@ -125,7 +133,7 @@ class Scales:
         moved = np.abs(states - states[:, :1]).max(axis=1, initial=0.0)
         size = np.abs(states).max(axis=1, initial=0.0)
         unresolved = moved < self.atol * self.scale
-        real = (moved > 0.0) & ~(unresolved & self.unresolved)
+        real = (moved > 0.0) & ~(unresolved & self.unresolved) & np.isin(np.arange(len(states)), moving)
         small = real & (moved < _SMALL * self.scale)
         about = real & (moved < _OFFSET * size) & (self.shift == 0.0)
         if not (small | about).any():
@@ -140,6 +148,12 @@ class Scales:
             return None
         scale = np.minimum(scale, np.where(small, self.scale, np.inf))
         return replace(self, shift=shift, scale=scale, unresolved=unresolved)
+
+    def with_sampled(self, states: Array, moving: NDArray[np.intp]) -> Scales:
+        """Scales in which those of states that are not integrated are their displacements in a run."""
+        scale = np.abs(states - states[:, :1]).max(axis=1, initial=0.0)
+        scale[moving] = self.scale[moving]
+        return replace(self, scale=scale)
 
     def perturbed(self, states: Array, rtol: Array | float, atol: float) -> Array:
         """States (nstates, ntime) moved by the tolerance of a step, up and down in turn."""
@@ -200,7 +214,7 @@ def output_uncertainty(
     Parameters
     ----------
     outputs : callable
-        Maps states (nstates, npoints) at some times to outputs (noutputs, npoints).
+        Maps states (nstates, n npoints), n times those at some times, to outputs (noutputs, n npoints).
     states : ndarray, shape (nstates, npoints)
         States at these times.
     uncertainty : ndarray, shape (nstates,)
@@ -209,18 +223,20 @@ def output_uncertainty(
         States whose effects are added; those of all others, the memories of
         sampled blocks, are found together.
     """
-    plain = outputs(states)
-    total = np.zeros(plain.shape)
     others = np.delete(np.arange(len(states)), moving)
+    groups, factors = [*moving[:, None], *([others] if others.size else [])], list[float]()
+    near = [states]
     with np.errstate(all="ignore"):
-        for rows in [*moving[:, None], *([others] if others.size else [])]:
+        for rows in groups:
             error = uncertainty[rows]
             # Steps large compared with rounding and small compared with the curvature of the outputs.
             large = 1e-7 * np.abs(states[rows]).max(axis=1, initial=0.0)
-            factor = float(np.max(large / error, initial=1.0, where=error > 0.0))
-            near = states.copy()
-            near[rows] += factor * error[:, None]
-            total += np.abs(outputs(near) - plain) / factor
+            factors.append(float(np.max(large / error, initial=1.0, where=error > 0.0)))
+            near.append(states.copy())
+            near[-1][rows] += factors[-1] * error[:, None]
+        plain, *found = np.split(outputs(np.concatenate(near, axis=1)), len(near), axis=1)
+        parts = [np.abs(displaced - plain) / factor for displaced, factor in zip(found, factors, strict=True)]
+        total = np.sum([np.zeros(plain.shape), *parts], axis=0)
     worst = np.where(np.isfinite(total), total, 0.0).max(axis=1, initial=0.0)
     return worst, np.ptp(plain, axis=1) if plain.shape[1] else np.zeros(len(plain))
 

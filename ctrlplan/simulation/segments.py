@@ -28,6 +28,7 @@ from ctrlplan.simulation.signals import (
     chebyshev_coefficients,
     chebyshev_times,
     resolved,
+    straight,
 )
 
 _WIDTH = 24
@@ -45,6 +46,9 @@ _SHORTEST_DELAY = 1e-5
 
 _TOLERANCE = 1e-12
 """Difference of two times, relative to the run, up to which they are considered equal."""
+
+_AHEAD = 256
+"""Number of samples at which functions of time are evaluated in one call."""
 
 _DENOMINATOR = 10**7
 """Maximum denominator of times that are interpreted as fractions, relative to the power of ten above them."""
@@ -127,6 +131,9 @@ class DelayedSignal:
             if piece.left < right - self.delay and piece.right > left - self.delay:
                 low, high = np.minimum(low, piece.low), np.maximum(high, piece.high)
         return low, high
+
+    def ends(self, left: float, right: float) -> None:
+        """None: stored signals are not known to be straight lines."""
 
     def at(self, times: Array) -> Array:
         """Stored values."""
@@ -212,7 +219,7 @@ def integrate(
         course.prolong(apart([first, *marks, last])[1:-1], first, last)
     memory, schedule, rounding = course.memory, course.schedule, course.rounding
     shortest, reach, longest = _lengths(network, memory.delays, last - first, stops_after is not None)
-    known: list[tuple[Array, Array]] = []  # times and states of each segment, without its end
+    known: list[tuple[float, Array, Array, Array]] = []  # of each segment: start, state, times inside, states there
     segments, span = list[tuple[float, Series]](), list[Series]()
     left = first
     x = schedule.sample(equations, first, state)
@@ -229,8 +236,8 @@ def integrate(
             span = _resolved(time_signals, 0.5 * (left + right), left, until, accuracy, error)
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
-        inside = times[slice(*np.searchsorted(times, [left, right]))]
-        grid = np.union1d(np.append(memory.nodes(left, right), right), inside[inside > left])
+        inside = times[times.searchsorted(left) : times.searchsorted(right)]
+        grid, requested = memory.grid(left, right, inside[1:] if inside.size and inside[0] <= left else inside)
         try:
             found = _advanced(solver, series, left, grid, x, last)
         except SolverError:
@@ -243,8 +250,7 @@ def integrate(
             continue
         schedule.add(memory.jumps)
         segments.append((left, series))
-        requested = np.isin(grid, inside)
-        known.append((np.append(left, grid[requested]), np.column_stack([x, found[:, requested]])))
+        known.append((left, x, grid[requested], found[:, requested]))
         before, x = x, found[:, -1]
         if ends or right < last:
             x = schedule.sample(equations, right, x)
@@ -252,13 +258,16 @@ def integrate(
             grid, found = np.append(left, grid), np.column_stack([before, found])
             stop = stops_after(grid, found)
             if stop is not None:  # what follows is not part of the run
-                before_stop = known[-1][0] < grid[stop]
-                known[-1] = known[-1][0][before_stop], known[-1][1][:, before_stop]
+                begin, start, inside, states = known.pop()
+                before_stop = inside < grid[stop]
+                known.append((begin, start, inside[before_stop], states[:, before_stop]))
                 left, x = float(grid[stop]), found[:, stop] if stop < grid.size - 1 else x
                 break
         left, reach = right, min(longest, 2.0 * reach)
-    known.append((np.array([left]), x[:, None]))
-    return NetworkRun(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), segments)
+    known.append((left, x, times[:0], np.empty((x.size, 0))))
+    t = np.concatenate([part for left, _, inside, _ in known for part in ((left,), inside)])
+    states = np.concatenate([part for _, start, _, found in known for part in (start[:, None], found)], axis=1)
+    return NetworkRun(t, states, segments)
 
 
 class Course:
@@ -368,6 +377,10 @@ def _resolved(
     time_signals: Sequence[TimeSignal], moment: float, left: float, until: float, accuracy: float, rounding: Array
 ) -> list[Series]:
     """Series and bounds of the signals in the segment of a time."""
+    lines = [signal.ends(left, until) for signal in time_signals]
+    known = [line for line in lines if line is not None]
+    if known and len(known) == len(lines):
+        return [straight(left, until, *(np.concatenate(values) for values in zip(*known, strict=True)))]
     signals = partial(_analytic_at, time_signals, moment, left)
     return [
         series.bounded(*_bounds(time_signals, moment, series.left, series.right))
@@ -403,9 +416,16 @@ class _Memory:
         self._ends: list[Array | None] = [None for _ in self._time_signals]
         self.jumps: list[float] = []
 
+    def grid(self, left: float, right: float, inside: Array) -> tuple[Array, NDArray[np.bool_] | slice]:
+        """Times of a segment at which states are required, the last its end, and which of them are those inside."""
+        if not self._time_signals:
+            return np.concatenate([inside, (right,)]), slice(inside.size)
+        grid = np.union1d(np.append(self.nodes(left, right), right), inside)
+        return grid, np.isin(grid, inside)
+
     def nodes(self, left: float, right: float) -> Array:
-        """Times of a segment at which states are required."""
-        return chebyshev_times(left, right, _WIDTH) if self._time_signals else np.empty(0)
+        """Times of a segment at which the inputs of delays are stored."""
+        return chebyshev_times(left, right, _WIDTH)
 
     def lengths(self) -> list[int]:
         """Number of stored pieces of each delay."""
@@ -478,6 +498,8 @@ class _Schedule:
 
     def __init__(self, network: Network, time_signals: Sequence[TimeSignal], first: float, last: float) -> None:
         self._time_signals, self._arrivals = time_signals, list[float]()
+        self._ahead: tuple[Array, Array] = np.empty(0), np.empty((0, 0))
+        self._tolerance = time_tolerance(first, last)
         self.prolong([], first, last)
         check_periods([network.blocks[i] for i in network.blocks_with("period")], first, last)
         self.samples = SampleTimes(network, first)
@@ -491,7 +513,7 @@ class _Schedule:
         """The next time after t."""
         later = bisect_right(self._arrivals, t + self._tolerance)
         due = min([self.fixed_after(t), *self._arrivals[later : later + 1]])
-        sample = float(self.samples.next)
+        sample = self.samples.seconds
         return sample if sample <= min(due + self._tolerance, self._fixed[-1]) else due
 
     def add(self, times: Sequence[float]) -> None:
@@ -505,20 +527,31 @@ class _Schedule:
 
     def on(self, times: Array, t: float) -> float:
         """Output time that equals a time up to rounding, so that its values are those after it."""
-        near = times[max(0, int(np.searchsorted(times, t)) - 1) :][:2]
-        close = near[np.abs(near - t) <= self._tolerance]
-        return float(close[0]) if close.size else t
+        k = int(times.searchsorted(t - self._tolerance))
+        near = float(times[k]) if k < times.size else math.inf
+        return near if abs(near - t) <= self._tolerance else t
 
     def sample(self, equations: Interpreted | None, t: float, x: Array) -> Array:
         """State after the samples of all blocks that are due at t."""
         due = self.samples.due(t + self._tolerance)
         if not due or equations is None:
             return x
-        return equations.sampled(due, t, x, values_after(self._time_signals, np.array([t]), self._tolerance)[:, 0])
+        return equations.sampled(due, t, x, self._values(t))
+
+    def _values(self, t: float) -> Array:
+        """Functions of time at a sample; for many samples together, unless some are only known during the run."""
+        times, values = self._ahead
+        k = int(times.searchsorted(t - self._tolerance))
+        if k == times.size or times[k] > t + self._tolerance:
+            count = 0 if any(isinstance(signal, DelayedSignal) for signal in self._time_signals) else _AHEAD
+            times = np.array([t, *self.samples.following(count, self._fixed[-1])])
+            values, k = values_after(self._time_signals, times, self._tolerance), 0
+            self._ahead = times, values
+        return np.asarray(values[:, k])
 
     def prolong(self, fixed: list[float], first: float, last: float) -> None:
         """Continue to a later end, with the breakpoints up to it."""
-        self._fixed = [*fixed, last]
+        self._fixed, self._ahead = [*fixed, last], (np.empty(0), np.empty((0, 0)))
         self._tolerance = time_tolerance(first, last)
         for signal in self._time_signals:
             if isinstance(signal, DelayedSignal):
@@ -537,23 +570,40 @@ class SampleTimes:
     def __init__(self, network: Network, first: float) -> None:
         blocks = network.blocks_with("period")
         traits = {i: network.blocks[i].traits for i in blocks}
-        self._periods = {i: as_fraction(traits[i].period or 0.0) for i in blocks}
-        self._times = [(as_fraction(first) + as_fraction(traits[i].offset), i) for i in blocks]
+        periods = {i: as_fraction(traits[i].period or 0.0) for i in blocks}
+        starts = {i: as_fraction(first) + as_fraction(traits[i].offset) for i in blocks}
+        # Times and periods are whole numbers of a common unit.
+        self._unit = math.lcm(*(value.denominator for value in (*periods.values(), *starts.values())))
+        self._periods = {i: int(period * self._unit) for i, period in periods.items()}
+        self._times = [(int(start * self._unit), i) for i, start in starts.items()]
         heapq.heapify(self._times)
 
     @property
     def next(self) -> Fraction | float:
         """Time of the next sample [s]; infinite if there is none."""
-        return self._times[0][0] if self._times else np.inf
+        return Fraction(self._times[0][0], self._unit) if self._times else np.inf
+
+    @property
+    def seconds(self) -> float:
+        """The same as a float."""
+        return self._times[0][0] / self._unit if self._times else math.inf
 
     def due(self, until: float) -> tuple[int, ...]:
         """Blocks with samples up to a time, which are then past."""
         found = []
-        while self._times and float(self._times[0][0]) <= until:
+        while self.seconds <= until:
             instant, i = self._times[0]
             heapq.heapreplace(self._times, (instant + self._periods[i], i))
             found.append(i)
         return tuple(sorted(found))
+
+    def following(self, count: int, last: float) -> list[float]:
+        """Times [s] of the next samples up to a time, at most so many."""
+        later, found = self.copy(), list[float]()
+        while len(found) < count and later.seconds <= last:
+            found.append(later.seconds)
+            later.due(found[-1])
+        return found
 
     def copy(self) -> SampleTimes:
         """Same times, which advance separately."""

@@ -108,6 +108,9 @@ class TimeSignal(Protocol):
         Bounds that a signal exceeds between the ends are ignored.
         """
 
+    def ends(self, left: float, right: float) -> tuple[Array, Array] | None:
+        """Values (nsignals,) at both ends of a segment if they are known to be straight lines; None otherwise."""
+
     def at(self, times: Array) -> Array:
         """Values (nsignals, ntime), right-continuous."""
 
@@ -136,6 +139,13 @@ class PlanSignal:
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
         """Bounds by the values of the plan at both ends."""
         return _ordered(self.analytic_at(moment, left, np.array([0.0, right - left])))
+
+    def ends(self, left: float, right: float) -> tuple[Array, Array] | None:
+        """Constant values of steps; other plans are not known to be straight lines."""
+        if not isinstance(self.plan, Step):
+            return None
+        value = self.analytic_at(0.5 * (left + right), left, np.zeros(1))[:, 0]
+        return value, value
 
     def at(self, times: Array) -> Array:
         """Values of the plan."""
@@ -166,6 +176,11 @@ class SampledSignal:
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
         """Bounds by the samples at both ends of a straight line."""
         return _ordered(self.values[None, self._line(moment)])
+
+    def ends(self, left: float, right: float) -> tuple[Array, Array] | None:
+        """Values at both ends of the line that contains the middle of a segment."""
+        first, last = self.analytic_at(0.5 * (left + right), left, np.array([0.0, right - left])).T
+        return first, last
 
     def at(self, times: Array) -> Array:
         """Interpolated values."""
@@ -305,6 +320,13 @@ def _ends_of_lines(times: Array, values: Array) -> NDArray[np.intp]:
 def _rounding_of_lines(times: Array, size: Array | float, steepness: Array | float) -> Array:
     """Rounding errors of samples of lines, by their values and by those of their times."""
     return 4.0 * np.finfo(float).eps * (size + steepness * np.abs(times[[0, -1]]).max())
+
+
+def straight(left: float, right: float, first: Array, last: Array) -> Series:
+    """Series of straight lines with values (nsignals,) at both ends, which are their bounds."""
+    constant = np.array_equal(first, last)
+    coefficients = first[:, None] if constant else np.column_stack([0.5 * (first + last), 0.5 * (last - first)])
+    return Series(left, right, coefficients, np.minimum(first, last), np.maximum(first, last))
 
 
 def _unbounded(left: float, right: float, coefficients: Array) -> Series:

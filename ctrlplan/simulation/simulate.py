@@ -20,6 +20,7 @@ from ctrlplan.simulation import methods
 from ctrlplan.simulation.budget import begin_run
 from ctrlplan.simulation.events import Events, Occurrence, Watched, crossings
 from ctrlplan.simulation.interpreted import FeedthroughError
+from ctrlplan.simulation.interruptions import passing_interruptions
 from ctrlplan.simulation.job import Job, Record, fresh_job
 from ctrlplan.simulation.methods import Method
 from ctrlplan.simulation.prepared import Prepared, prepared_form
@@ -277,11 +278,12 @@ def _occurrences(record: Record) -> list[Occurrence]:
     if not record.watched:
         return []
     seen, found = record.snapshot(record.times, record.states), []
-    for entry in record.watched:
-        found += crossings(entry, record.times, entry.value(seen), partial(_value_at, record, entry))
+    with passing_interruptions():
+        for entry in record.watched:
+            found += crossings(entry, record.times, entry.value(seen), partial(_value_at, record, entry))
     return sorted(found, key=lambda occurrence: occurrence.time)
 
 
 def _value_at(record: Record, entry: Watched, k: int, t: float) -> float:
     """Signal of an event at a time between times[k] and times[k + 1] of a record."""
-    return float(entry.value(record.snapshot(np.array([t]), record.state_at(k, t)[:, None]))[0])
+    return float(entry.value(record.snapshot_at(k, t))[0])

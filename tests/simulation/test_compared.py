@@ -77,20 +77,14 @@ def test_a_wrong_trace_shows_in_a_later_run_on_a_new_side_of_a_switch():
 @pytest.mark.parametrize("times", [OSCILLATION, np.linspace(0.0, 12.0, 1201)], ids=["few times", "many"])
 def test_a_comparison_costs_a_fifth_of_the_run_at_most(monkeypatch, times):
     compared, evaluated = [], []
-    agrees, called = compiled_module.agrees, compiled_module._called
+    agrees, evaluations = compiled_module.agrees, compiled_module.Segment.evaluations
 
-    def noting(function, arguments, nrows, report=None):
-        if report is None:
-            return called(function, arguments, nrows)
-        return called(
-            function,
-            arguments,
-            nrows,
-            lambda stats: evaluated.append((len(compared), stats["nfevals"])) or report(stats),
-        )
+    def noting(segment):
+        evaluated.append((len(compared), evaluations(segment)))
+        return evaluated[-1][1]
 
     monkeypatch.setattr(compiled_module, "agrees", lambda *given: compared.append(given[3].size) or agrees(*given))
-    monkeypatch.setattr(compiled_module, "_called", noting)
+    monkeypatch.setattr(compiled_module.Segment, "evaluations", noting)
     spring = ct.nlsys(
         lambda t, x, u, p: [x[1], -x[0] - 5.0 * np.maximum(x[0] - 0.5, 0.0)], None, inputs=0, outputs=2, states=2
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
-from ctrlplan.simulation import compiled
+from ctrlplan.simulation import interruptions
 
 pytestmark = pytest.mark.skipif(
     not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread(),
@@ -81,7 +81,7 @@ def test_a_signal_while_handlers_are_exchanged_reaches_the_caller_and_leaves_the
     system = fast()
     cp.simulate(system, [0.0, 0.001], None, [1.0, 0.0], method="compiled")  # compiled before
     handler = alarm(KeyboardInterrupt)
-    monkeypatch.setattr(compiled, "_SIGNALS", Signals())
+    monkeypatch.setattr(interruptions, "_SIGNALS", Signals())
     with pytest.raises(KeyboardInterrupt):
         cp.simulate(system, [0.0, 0.001], None, [1.0, 0.0], method="compiled")
     assert signal.getsignal(signal.SIGALRM) is handler
@@ -115,3 +115,21 @@ def test_runs_in_other_threads_leave_handlers_alone():
     thread.join()
     assert len(found) == 1
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_handler_that_simulates_the_same_system_does_not_change_the_run(alarm):
+    system, t, inner = fast(), np.linspace(0, 0.5, 3), []
+    before = signal.getsignal(signal.SIGALRM)
+    plain = cp.simulate(system, t, None, [1.0, 0.0], method="compiled")
+    signal.signal(
+        signal.SIGALRM,
+        lambda number, frame: inner.append(cp.simulate(system, t, None, [0.5, 0.0], method="compiled")),
+    )
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
+        found = cp.simulate(system, t, None, [1.0, 0.0], method="compiled")
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert np.array_equal(found.outputs, plain.outputs)
+    assert np.array_equal(inner[0].outputs, cp.simulate(system, t, None, [0.5, 0.0], method="compiled").outputs)

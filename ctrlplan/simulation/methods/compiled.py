@@ -11,6 +11,7 @@ import numpy as np
 from ctrlplan._types import Array
 from ctrlplan.simulation.built_forms import DisagreementError
 from ctrlplan.simulation.interpreted import SolverError
+from ctrlplan.simulation.interruptions import passing_interruptions
 from ctrlplan.simulation.job import Job, Record, fresh_job
 from ctrlplan.simulation.numerical import VISITED, Attempt, equations_of, numerical
 from ctrlplan.simulation.prepared import Prepared
@@ -52,10 +53,11 @@ class CompiledMethod:
             If a block cannot be traced at these parameters, or disagrees with Python.
         """
         fresh = fresh_job(job)
-        try:
-            return numerical(job, self)
-        except DisagreementError:  # an object used by a function may have changed since it was traced
-            return numerical(fresh, self)
+        with passing_interruptions():
+            try:
+                return numerical(job, self)
+            except DisagreementError:  # an object used by a function may have changed since it was traced
+                return numerical(fresh, self)
 
     def solver(self, attempt: Attempt[CompiledSolver]) -> CompiledSolver:
         """CVODES on the compiled form."""
@@ -63,7 +65,7 @@ class CompiledMethod:
         form = job.prepared.compiled(job.params, attempt.time_signals, job.first, job.state, job.trials)
         from ctrlplan.simulation.compiled import CompiledSolver  # the form exists, hence CasADi is installed
 
-        known = equations_of(job, attempt.copies)
+        known = equations_of(job, attempt.copies) if form.has_loops else None
         if known is not None:  # an algebraic loop without a solution gives a clearer error here
             known.signals(job.first, job.state, signal_values(attempt.time_signals, job.times[:1])[:, 0])
         max_steps = _STEPS_WITH_STOPS if attempt.stops else _STEPS
@@ -72,7 +74,7 @@ class CompiledMethod:
     def check(self, attempt: Attempt[CompiledSolver]) -> None:
         """Compare with Python, at states of the run."""
         solver, job = attempt.solver, attempt.job
-        if solver.near_undefined(*attempt.visited()):
+        if solver.near_undefined(*attempt.visited):
             raise SolverError(
                 f"the solver must reach {job.times[-1]:g} s, got to a state at which the equations are undefined"
             )
@@ -85,7 +87,7 @@ def _disagreement(attempt: Attempt[CompiledSolver], solver: CompiledSolver) -> s
     """Disagreement of a compiled form with Python at states of a run; empty if none, or if no comparison is due."""
     job, run, form = attempt.job, attempt.run, solver.form
     p = form.parameters(job.params)
-    values = signal_values(attempt.time_signals, run.times)
+    values = attempt.time_values(run.times)
     if not form.compared.is_due(form.sides(run.times, run.states, values, p)):
         return ""
     count = max(1, solver.evaluations // _SHARE) if solver.evaluations else VISITED

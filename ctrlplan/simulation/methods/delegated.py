@@ -52,7 +52,7 @@ class Delegated:
 
         def snapshot(t: Array, x: Array) -> Snapshot:
             at = np.searchsorted(job.times, t, side="right") - 1
-            return Snapshot(t, x, u[:, at], outputs[:, at])
+            return Snapshot(t, x, u[:, at], lambda: outputs[:, at])
 
         return Record(
             job.times, response.x, snapshot, lambda k, t: response.x[:, k], (), self.name, prepared.unsupported

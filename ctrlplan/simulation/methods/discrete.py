@@ -57,7 +57,7 @@ class Discrete:
         def snapshot(t: Array, x: Array) -> Snapshot:
             now = signal_values(time_signals, _on_breakpoints(t, breakpoints))
             w = signals[:, np.searchsorted(instants, t, side="right") - 1]
-            return Snapshot(t, x, now[: prepared.ninputs], network.to_outputs(w), lambda: w)
+            return Snapshot(t, x, now[: prepared.ninputs], lambda: network.to_outputs(w), lambda: w)
 
         # Signals are constant between samples: a limit is crossed at the later one.
         return Record(instants, states, snapshot, lambda k, t: states[:, k], job.watched(), self.name, job.reason)

@@ -80,7 +80,7 @@ def _run_sampled(job: Job, form: SampledForm) -> Record:
         def signals() -> Array:
             return np.asarray(form.signals_z @ z + form.signals_w @ w)
 
-        return Snapshot(t, x, w[: job.prepared.ninputs], form.c @ z + form.d @ w, signals)
+        return Snapshot(t, x, w[: job.prepared.ninputs], lambda: form.c @ z + form.d @ w, signals)
 
     def interpolate(k: int, t: float) -> Array:
         return motion.at(np.array([t]))[:n, 0]
@@ -107,7 +107,7 @@ def _run_delayed(job: Job, form: DelayedForm) -> Record:
     def snapshot(t: Array, x: Array) -> Snapshot:
         w = motion.at(t)[1]
         signals = form.base.signals_z @ x + form.base.signals_w @ w
-        return Snapshot(t, x, w[: job.prepared.ninputs], form.base.read @ signals, lambda: signals)
+        return Snapshot(t, x, w[: job.prepared.ninputs], lambda: form.base.read @ signals, lambda: signals)
 
     def interpolate(k: int, t: float) -> Array:
         return motion.at(np.array([t]))[0][:, 0]
@@ -134,7 +134,7 @@ def _run(job: Job, form: LinearForm) -> Record:
 
     def snapshot(t: Array, x: Array) -> Snapshot:
         values = signal_values(time_signals, t)
-        return Snapshot(t, x, values[: job.prepared.ninputs], form.outputs(x, values))
+        return Snapshot(t, x, values[: job.prepared.ninputs], lambda: form.outputs(x, values))
 
     def states_at(t: Array, state: Array, a: Array = form.a) -> Array:
         if sampled.size and sampled.all():

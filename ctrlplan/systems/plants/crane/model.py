@@ -187,7 +187,7 @@ def update(
     crane: CraneParameters, t: float, state: Array, inputs: Array, params: Params, lag: float | None = None
 ) -> Array:
     """Derivatives of the states, in the form of `control.nlsys`."""
-    d2, r2, theta2, _ = _driven(crane, lag, state, inputs, params)
+    d2, r2, theta2, _ = _driven(crane, crane.numbers(params), lag, state, inputs, params)
     return np.array([state[3], state[4], state[5], d2, r2, theta2])
 
 
@@ -197,7 +197,7 @@ def output(
     """`OUTPUTS`, and those of a velocity drive, in the form of `control.nlsys`."""
     numbers = crane.numbers(params)
     x, z, x_rate, z_rate = load(numbers[3], state)
-    d2, _, _, tension = _driven(crane, lag, state, inputs, params)
+    d2, _, _, tension = _driven(crane, numbers, lag, state, inputs, params)
     rows = [x, z, state[0], state[1], state[2], x_rate, z_rate, state[3], state[4], state[5], tension]
     if lag is not None:
         _, trolley, _, _, friction, _, gravity = numbers
@@ -258,10 +258,9 @@ def load(b: float, state: Quantity) -> tuple[Quantity, Quantity, Quantity, Quant
 
 
 def _driven(
-    crane: CraneParameters, lag: float | None, state: Array, inputs: Array, params: Params
+    crane: CraneParameters, numbers: Numbers, lag: float | None, state: Array, inputs: Array, params: Params
 ) -> tuple[Quantity, Quantity, Quantity, Quantity]:
     """D'', R'', theta'' and T for inputs of the block; the wind is 0 if it is not an input."""
-    numbers = crane.numbers(params)
     if lag is None:
         trolley = by_force(numbers, state, inputs[0])
     else:

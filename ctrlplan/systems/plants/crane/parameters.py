@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ctrlplan.systems.plants.parameters import check_parameters, defaults_of, overridden, parameter
+from ctrlplan.systems.plants.parameters import check_parameters, parameter
 
 Numbers = tuple[float, float, float, float, float, float, float]
 """m, M_c, J, b, f1, f2, g."""
@@ -31,5 +31,13 @@ class CraneParameters:
 
     def numbers(self, params: Mapping[str, float] | None = None) -> Numbers:
         """m, M_c, J, b, f1, f2, g, each overridden by a simulation parameter of its name."""
-        m, trolley, inertia, b, f1, f2, g = overridden(defaults_of(self), params)
-        return m, trolley, inertia, b, f1, f2, g
+        given = ({} if params is None else params).get  # called twice per evaluation of a loop
+        return (
+            given("load_mass", self.load_mass),
+            given("trolley_mass", self.trolley_mass),
+            given("drum_inertia", self.drum_inertia),
+            given("drum_radius", self.drum_radius),
+            given("trolley_friction", self.trolley_friction),
+            given("drum_friction", self.drum_friction),
+            given("gravity", self.gravity),
+        )

@@ -1,0 +1,425 @@
+"""Nonlinear loops compared with right-hand sides written by hand, in turn in one process; ratios of CPU time are
+printed, none is asserted.
+
+Compiled loops: the same equations as CasADi functions, solved by CVODES from breakpoint to breakpoint. Loops by Python:
+one function of plain numbers, solved by LSODA. The tolerances of the peers are those at which their errors are about
+those of `simulate`, whose own are a hundredth of the requested ones.
+"""
+
+import math
+from itertools import pairwise
+from time import process_time
+
+import casadi as ca
+import control as ct
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import ctrlplan as cp
+from ctrlplan.studies.crane import CRANE, obstacle_waypoints
+
+ROUNDS = 5
+
+
+def interleaved(ours, peer, rounds=ROUNDS):
+    """Minimum seconds of both, run in turn, and their last results."""
+    rows = []
+    for _ in range(rounds):
+        seconds, results = [], []
+        for function in (ours, peer):
+            begin = process_time()
+            results.append(function())
+            seconds.append(process_time() - begin)
+        rows.append(seconds)
+    return [min(column) for column in zip(*rows, strict=True)], results
+
+
+def worst(found, tight):
+    """Largest error of any row relative to its largest value."""
+    found, tight = np.atleast_2d(found), np.atleast_2d(tight)
+    return float((np.abs(found - tight).max(axis=1) / np.abs(tight).max(axis=1)).max())
+
+
+def show(capsys, benchmark, what, seconds, errors):
+    benchmark.extra_info["ratio"] = seconds[0] / seconds[1]
+    with capsys.disabled():
+        print(
+            f"\n{what}: {1e3 * seconds[0]:.2f} ms, by hand {1e3 * seconds[1]:.2f} ms, "
+            f"ratio {seconds[0] / seconds[1]:.2f}; errors {errors[0]:.1e} and {errors[1]:.1e}"
+        )
+
+
+def solved_by_cvodes(rates, state, times, breaks, tolerance, parameter=None):
+    """Function that integrates rates(t, x, segment) from break to break, of CasADi symbols; built once.
+
+    With the symbol of a parameter, it is a function of its value.
+    """
+    runs = []
+    for k, (left, right) in enumerate(pairwise([times[0], *breaks, times[-1]])):
+        grid = np.union1d(times[(times > left) & (times <= right)], right)
+        t, x = ca.SX.sym("t"), ca.SX.sym("x", len(state))
+        equations = {"t": t, "x": x, "ode": rates(t, x, k)} | ({} if parameter is None else {"p": parameter})
+        options = {"reltol": tolerance, "abstol": 1e-2 * tolerance, "linear_multistep_method": "adams"}
+        options["max_num_steps"] = 100_000
+        runs.append((ca.integrator("run", "cvodes", equations, left, grid, options), np.isin(grid, times)))
+
+    def run(value=0.0):
+        x, rows = np.asarray(state), [np.asarray(state)[:, None]]
+        for integrator, asked in runs:
+            found = np.asarray(integrator(x0=x, **({} if parameter is None else {"p": value}))["xf"])
+            x = found[:, -1]
+            rows.append(found[:, asked])
+        return np.hstack(rows)
+
+    return run
+
+
+def solved_by_python(rates, state, times, breaks, tolerance, method="LSODA"):
+    """States at the times, by solve_ivp from break to break; rates(t, x, segment) of plain numbers."""
+    state, rows = np.asarray(state, dtype=float), [np.asarray(state, dtype=float)[:, None]]
+    options = {"rtol": tolerance, "atol": 1e-2 * tolerance}
+    for k, (left, right) in enumerate(pairwise([times[0], *breaks, times[-1]])):
+        grid = np.union1d(times[(times > left) & (times <= right)], right)
+        found = solve_ivp(lambda t, x, k=k: rates(t, x.tolist(), k), (left, right), state, method, grid, **options)
+        state = found.y[:, -1]
+        rows.append(found.y[:, np.isin(grid, times)])
+    return np.hstack(rows)
+
+
+class PLAIN:
+    """Functions of plain numbers."""
+
+    sin, cos, tanh, sqrt, fmin, fmax = math.sin, math.cos, math.tanh, math.sqrt, min, max
+
+
+CASADI = ca
+"""The same of CasADi's symbols."""
+
+
+# The crane of the study
+
+
+PLAN = cp.TrigSpline(obstacle_waypoints(), alpha=4.0)
+T = np.linspace(0.0, 30.0, 3001)
+
+
+def planned(t, segment, m):
+    """x, x'', z, z'' of the load by equation (2), the harmonics by one sine and one cosine."""
+    if segment:
+        return PLAN.final[0], 0.0, PLAN.final[1], 0.0
+    tau = RATE * (t - PLAN.start)
+    c1, s1 = m.cos(tau), m.sin(tau)
+    c, s, found = c1, s1, [FOURIER.a0[0], 0.0, FOURIER.a0[1], 0.0]
+    for k, ((ax, az), (bx, bz)) in enumerate(HARMONICS, 1):
+        x, z, factor = ax * c + bx * s, az * c + bz * s, (k * RATE) ** 2
+        found = [found[0] + x, found[1] - factor * x, found[2] + z, found[3] - factor * z]
+        c, s = c * c1 - s * s1, s * c1 + c * s1
+    return found
+
+
+def harmonics():
+    """(a_x, a_z), (b_x, b_z) of each harmonic; the last one is a_m sin m(tau - gamma)."""
+    m, gamma = FOURIER.m[0], FOURIER.gamma
+    top = (-FOURIER.am * np.sin(m * gamma), FOURIER.am * np.cos(m * gamma))
+    return np.concatenate([np.stack([FOURIER.a.T, FOURIER.b.T], axis=1), [top]]).tolist()
+
+
+FOURIER, RATE = PLAN.fourier(), PLAN.alpha / PLAN.duration
+HARMONICS = harmonics()
+TROLLEY, INERTIA, DRUM, G = CRANE.trolley_mass, CRANE.drum_inertia, CRANE.drum_radius, CRANE.gravity
+LOAD, F1, F2 = CRANE.load_mass, CRANE.trolley_friction, CRANE.drum_friction
+W, TF, HOIST = 5.0, 0.02, INERTIA / DRUM + LOAD * DRUM
+
+
+def crane_rates(t, s, segment, m=PLAIN, mass=LOAD):
+    """Generator, two PIDs and crane; states as in `crane_loop`."""
+    x, x2, z, z2 = planned(t, segment, m)
+    hanging = G - z2
+    pull = m.sqrt(x2 * x2 + hanging * hanging)
+    e1 = x - (DRUM * pull - z * x2) / hanging - s[4]
+    e2 = (z * pull - DRUM * x2) / hanging - s[5]
+    p1, i1, d1 = 3.0 * TROLLEY * W**2, TROLLEY * W**3, 3.0 * TROLLEY * W - F1
+    p2, i2, d2 = 3.0 * HOIST * W**2, HOIST * W**3, 3.0 * HOIST * W - F2 / DRUM
+    force = p1 * e1 + s[0] + d1 / TF * (e1 - s[1])
+    torque = -DRUM * LOAD * G + p2 * e2 + s[2] + d2 / TF * (e2 - s[3])
+    r, theta, d_rate, r_rate, rate = s[5], s[6], s[7], s[8], s[9]
+    sine, cosine = m.sin(theta), m.cos(theta)
+    d0, dt = (force - F1 * d_rate) / TROLLEY, sine / TROLLEY
+    swing = -G * sine - 2.0 * r_rate * rate + DRUM * rate * rate
+    t0, tt = (swing - cosine * d0) / r, -cosine * dt / r
+    r0, rt = DRUM / INERTIA * (torque - F2 * r_rate / DRUM), DRUM * DRUM / INERTIA
+    along = G * cosine + r * rate * rate
+    tension = (along - sine * d0 - r0 + DRUM * t0) / (sine * dt + rt + 1.0 / mass - DRUM * tt)
+    accelerations = [d0 + dt * tension, r0 + rt * tension, t0 + tt * tension]
+    return [i1 * e1, (e1 - s[1]) / TF, i2 * e2, (e2 - s[3]) / TF, d_rate, r_rate, rate, *accelerations]
+
+
+def in_casadi(rates, **given):
+    return lambda t, x, segment: ca.vertcat(*rates(t, ca.vertsplit(x), segment, CASADI, **given))
+
+
+@pytest.fixture(scope="module")
+def crane():
+    """The prepared loop and its states at tight tolerances."""
+    loop = cp.plants.crane_loop(CRANE, PLAN)
+    tight = solved_by_python(crane_rates, loop.initial_state, T, [PLAN.end], 1e-13, "DOP853")
+    return cp.prepare(loop), tight
+
+
+@pytest.mark.benchmark
+def test_crane_by_compiled(benchmark, capsys, crane):
+    ready, tight = crane
+    peer = solved_by_cvodes(in_casadi(crane_rates), ready.initial_state, T, [PLAN.end], 1e-10)
+
+    def ours():
+        return cp.simulate(ready, T, method="compiled")
+
+    benchmark.pedantic(ours, rounds=3, warmup_rounds=3)
+    seconds, (found, theirs) = interleaved(ours, peer)
+    errors = worst(found.states, tight), worst(theirs, tight)
+    assert max(errors) <= 1e-8
+    show(capsys, benchmark, "crane, compiled, 3001 samples", seconds, errors)
+
+
+@pytest.mark.benchmark
+def test_draws_by_compiled(benchmark, capsys, crane):
+    """Draws of the load mass, one run each."""
+    ready, _ = crane
+    masses = np.linspace(400.0, 700.0, 20).tolist()
+    symbol = ca.SX.sym("m")
+    rates = in_casadi(crane_rates, mass=symbol)
+    peer = solved_by_cvodes(rates, ready.initial_state, T, [PLAN.end], 1e-10, symbol)
+
+    def ours():
+        return [cp.simulate(ready, T, method="compiled", params={"load_mass": mass}).states for mass in masses]
+
+    def theirs():
+        return [peer(mass) for mass in masses]
+
+    benchmark.pedantic(ours, rounds=1, warmup_rounds=1)
+    seconds, (found, expected) = interleaved(ours, theirs, 3)
+    apart = max(worst(a, b) for a, b in zip(found, expected, strict=True))
+    assert apart <= 1e-7
+    show(capsys, benchmark, "20 draws of the crane, compiled", seconds, (apart, apart))
+
+
+@pytest.mark.benchmark
+def test_crane_by_python(benchmark, capsys, crane):
+    ready, tight = crane
+
+    def ours():
+        return cp.simulate(ready, T, method="python")
+
+    def peer():
+        return solved_by_python(crane_rates, ready.initial_state, T, [PLAN.end], 1e-10)
+
+    benchmark.pedantic(ours, rounds=1, warmup_rounds=1)
+    seconds, (found, theirs) = interleaved(ours, peer, 3)
+    errors = worst(found.states, tight), worst(theirs, tight)
+    assert max(errors) <= 1e-7
+    show(capsys, benchmark, "crane, python, 3001 samples", seconds, errors)
+
+
+# A saturated loop and an aircraft that takes off and lands vertically
+
+
+SHORT = np.linspace(0.0, 20.0, 2001)
+EPS = 0.3
+
+
+def quintic(t, first, last, distance):
+    s = (t - first) / (last - first)
+    return distance * s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
+
+
+def saturated_loop():
+    plan = cp.PolySpline([cp.Waypoint(0.5, 0, 0, 0), cp.Waypoint(1.5, 3, 0, 0)], labels=["r"])
+    law = ct.ss([], [], [], [[4.0, -4.0, -2.0]], inputs=["r", "x", "v"], outputs="u_cmd", name="law", dt=None)
+    plant = ct.ss([[0, 1], [0, -1]], [[0], [1]], np.eye(2), 0, inputs="u", outputs=["x", "v"], name="plant")
+    blocks = [cp.create_source_iosystem(plan), law, cp.create_saturation_iosystem(-0.5, 2.0), plant]
+    return ct.interconnect(blocks, inputs=0, outputs=["x", "u"])
+
+
+def saturated_rates(t, x, segment, m):
+    r = quintic(t, 0.5, 1.5, 3.0) if segment == 1 else 0.0 if segment == 0 else 3.0
+    return [x[1], -x[1] + m.fmin(m.fmax(4.0 * (r - x[0]) - 2.0 * x[1], -0.5), 2.0)]
+
+
+def pvtol(t, x, u, params):
+    s, c = np.sin(x[2]), np.cos(x[2])
+    return np.array([x[3], x[4], x[5], -u[0] * s + EPS * u[1] * c, u[0] * c + EPS * u[1] * s - 1.0, u[1]])
+
+
+def hover(t, x, u, params):
+    """Height by thrust, position by tilt."""
+    z_ref, px, pz, th, vx, vz, w = (u[k] for k in range(7))
+    thrust = (1.0 + 2.0 * (z_ref - pz) - 2.0 * vz) / np.cos(th)
+    return np.array([thrust, 9.0 * (0.3 * np.tanh(px + 1.5 * vx) - th) - 5.0 * w])
+
+
+def pvtol_loop():
+    names = ["px", "pz", "th", "vx", "vz", "w"]
+    plan = cp.PolySpline([cp.Waypoint(1, 0, 0, 0), cp.Waypoint(3, 2, 0, 0)], labels=["z_ref"])
+    plant = ct.nlsys(pvtol, None, inputs=["u1", "u2"], outputs=names, states=6, name="pvtol")
+    law = ct.nlsys(None, hover, inputs=["z_ref", *names], outputs=["u1", "u2"], name="hover", dt=None)
+    return ct.interconnect([plant, law, cp.create_source_iosystem(plan)], inputs=0, outputs=[*names, "u1", "u2"])
+
+
+def pvtol_rates(t, x, segment, m):
+    z_ref = quintic(t, 1.0, 3.0, 2.0) if segment == 1 else 0.0 if segment == 0 else 2.0
+    thrust = (1.0 + 2.0 * (z_ref - x[1]) - 2.0 * x[4]) / m.cos(x[2])
+    moment = 9.0 * (0.3 * m.tanh(x[0] + 1.5 * x[3]) - x[2]) - 5.0 * x[5]
+    s, c = m.sin(x[2]), m.cos(x[2])
+    return [x[3], x[4], x[5], -thrust * s + EPS * moment * c, thrust * c + EPS * moment * s - 1.0, moment]
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize(
+    ("name", "loop", "rates", "start", "breaks", "events"),
+    [
+        ("saturated loop with its events", saturated_loop, saturated_rates, [0.0] * 2, [0.5, 1.5], None),
+        ("saturated loop without events", saturated_loop, saturated_rates, [0.0] * 2, [0.5, 1.5], ()),
+        ("PVTOL", pvtol_loop, pvtol_rates, [1.0, 0.5, -0.2, 0.0, 0.3, 0.1], [1.0, 3.0], None),
+    ],
+)
+def test_short_loops_by_compiled(name, loop, rates, start, breaks, events, benchmark, capsys):
+    ready = cp.prepare(loop())
+    peer = solved_by_cvodes(in_casadi(rates), start, SHORT, breaks, 1e-10)
+    tight = solved_by_python(lambda t, x, k: rates(t, x, k, PLAIN), start, SHORT, breaks, 1e-13, "DOP853")
+
+    def ours():
+        return cp.simulate(ready, SHORT, None, start, method="compiled", events=events)
+
+    benchmark.pedantic(ours, rounds=3, warmup_rounds=3)
+    seconds, (found, theirs) = interleaved(ours, peer, 10)
+    errors = worst(found.states, tight), worst(theirs, tight)
+    assert max(errors) <= 1e-8
+    show(capsys, benchmark, f"{name}, 2001 samples", seconds, errors)
+
+
+# A pendulum with a sampled law, and with samples as its input
+
+
+PERIOD = 0.01
+AT_SAMPLES = np.linspace(0.0, 10.0, 1001)
+SWING = cp.PolySpline([cp.Waypoint(0.5, 0, 0, 0), cp.Waypoint(4.5, 1.0, 0, 0)], labels=["r"])
+LAW = ([[1, 0], [0, 0.6]], [[PERIOD, -PERIOD], [0.4, -0.4]], [[30.0, -60.0]], [[100.0, -100.0]])
+
+
+def pendulum(t, x, u, params):
+    return [x[1], -9.81 * np.sin(x[0]) - 0.3 * x[1] * np.abs(x[1]) + u[0]]
+
+
+def pendulum_block():
+    return ct.nlsys(pendulum, None, inputs="u", outputs=["q", "w"], states=2, name="pendulum")
+
+
+def sampled_by_hand(method, rtol, atol):
+    """solve_ivp from sample to sample."""
+    x, xi, out, r = np.zeros(2), [0.0, 0.0], np.empty((2, AT_SAMPLES.size)), SWING(AT_SAMPLES).tolist()
+    times = AT_SAMPLES.tolist()
+    for k, (left, right) in enumerate(pairwise([*times, times[-1]])):
+        out[:, k] = x
+        if right == left:
+            return out
+        e = r[k] - x[0]
+        u = 30.0 * xi[0] - 60.0 * xi[1] + 100.0 * e
+        xi = [xi[0] + PERIOD * e, 0.6 * xi[1] + 0.4 * e]
+
+        def rates(t, s, u=u):
+            return s[1], -9.81 * math.sin(s[0]) - 0.3 * s[1] * abs(s[1]) + u
+
+        x = solve_ivp(rates, (left, right), x, method, rtol=rtol, atol=atol).y[:, -1]
+    return out
+
+
+@pytest.mark.benchmark
+def test_sampled_law(benchmark, capsys):
+    """solve_ivp at its own best: RK45, whose steps are shorter than a period anyway."""
+    names = {"inputs": ["r", "q"], "outputs": "u", "name": "law"}
+    law = cp.sample_hold(ct.ss(*LAW, PERIOD, **names), PERIOD)
+    ready = cp.prepare(ct.interconnect([pendulum_block(), law], inputs="r", outputs=["q", "w", "u"]))
+
+    def ours():
+        return cp.simulate(ready, AT_SAMPLES, SWING)
+
+    def peer():
+        return sampled_by_hand("RK45", 1e-8, 1e-10)
+
+    benchmark.pedantic(ours, rounds=1, warmup_rounds=3)
+    seconds, (found, theirs) = interleaved(ours, peer, 3)
+    tight = sampled_by_hand("DOP853", 1e-13, 1e-14)
+    errors = worst(found.states[:2], tight), worst(theirs, tight)
+    assert found.method == "compiled"
+    assert max(errors) <= 1e-8
+    show(capsys, benchmark, "sampled law, 1000 periods", seconds, errors)
+
+
+def driven(samples, tolerance):
+    """The pendulum with interpolated samples by hand, as one segment."""
+
+    def rates(t, x):
+        torque = np.interp(t, T, samples)
+        return x[1], -9.81 * math.sin(x[0]) - 0.3 * x[1] * abs(x[1]) + torque
+
+    options = {"rtol": tolerance, "atol": 1e-2 * tolerance}
+    return solve_ivp(rates, (T[0], T[-1]), [0.0, 0.0], "LSODA", T, **options).y
+
+
+def driven_line_by_line(samples):
+    """The same with tight tolerances, from sample to sample."""
+    x = np.zeros(2)
+    out = [x]
+    for (left, first), (right, last) in pairwise(zip(T.tolist(), samples.tolist(), strict=True)):
+
+        def rates(t, s, left=left, first=first, slope=(last - first) / (right - left)):
+            return s[1], -9.81 * math.sin(s[0]) - 0.3 * s[1] * abs(s[1]) + first + slope * (t - left)
+
+        x = solve_ivp(rates, (left, right), x, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+        out.append(x)
+    return np.array(out).T
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("kind", ["31 knots", "random"])
+def test_samples_as_input(kind, benchmark, capsys):
+    rng = np.random.default_rng(0)
+    knots, torques = np.linspace(0.0, 30.0, 31), rng.uniform(-5.0, 5.0, 31)
+    samples = np.interp(T, knots, torques) if kind == "31 knots" else rng.uniform(-5.0, 5.0, T.size)
+    ready = cp.prepare(pendulum_block())
+
+    def ours():
+        return cp.simulate(ready, T, samples)
+
+    def peer():
+        return driven(samples, 1e-9)
+
+    benchmark.pedantic(ours, rounds=1, warmup_rounds=3)
+    seconds, (found, theirs) = interleaved(ours, peer, 2)
+    tight = driven_line_by_line(samples)
+    errors = worst(found.states, tight), worst(theirs, tight)
+    assert errors[0] <= 1e-8
+    assert errors[1] <= 1e-5
+    show(capsys, benchmark, f"input of 3001 samples, {kind}", seconds, errors)
+
+
+@pytest.mark.benchmark
+def test_samples_on_lines_next_to_a_plan(benchmark, capsys):
+    """31 knots sampled at 3001 times, next to a plan with as many segments."""
+    rng = np.random.default_rng(0)
+    knots, torques = np.linspace(0.0, 30.0, 31), rng.uniform(-5.0, 5.0, 31)
+    samples = np.interp(T, knots, torques)
+    points = [cp.Waypoint(t, torque, 0, 0) for t, torque in zip(knots.tolist(), torques.tolist(), strict=True)]
+    plan, ready = cp.PiecewiseSpline(points), cp.prepare(pendulum_block())
+
+    def ours():
+        return cp.simulate(ready, T, samples)
+
+    def other():
+        return cp.simulate(ready, T, plan)
+
+    benchmark.pedantic(ours, rounds=1, warmup_rounds=3)
+    seconds, _ = interleaved(ours, other)
+    with capsys.disabled():
+        print(f"\nsamples on 30 lines: {1e3 * seconds[0]:.1f} ms, plan of 30 segments {1e3 * seconds[1]:.1f} ms")
