@@ -166,7 +166,7 @@ class FreePattern:
         where = "waypoints" if self.closed else "inner waypoints"
         got = "" if self.given[:, 0].any() else ", got an axis without any prescribed position"
         ends = "" if self.closed else ", such as derivatives at the first and last waypoint"
-        return f"free entries at {where} must be determined by the prescribed ones{got}; prescribe more{ends}"
+        return f"free entries at {where} must be determined by the prescribed ones; prescribe more{ends}{got}"
 
     def _prescribed(self, kind: Kind) -> list[tuple[int, slice]]:
         """Entries of a kind of segments, and the segments from the first to the last in which each is prescribed."""
