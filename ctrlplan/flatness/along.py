@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
-from ctrlplan.flatness.maps import TRIALS, FlatMaps, SingularError, inverses
+from ctrlplan.flatness.maps import TRIALS, TRIALS_TOGETHER, FlatMaps, SingularError, inverses
 from ctrlplan.flatness.rest import ADVICE, note_of_rest
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.trajectory import check_end
@@ -156,6 +156,27 @@ def connected_with_neighbour(maps: FlatMaps, flag: Array, p: Array, z: Array, na
     return _connected(maps, flag, p, z, 2, _DETOUR // 5, name)
 
 
+def connected_with_neighbours(maps: FlatMaps, flags: Array, p: Array, z: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """States (nz, n) of flags (nz, n), each connected with a given one, and which were found.
+
+    As `connected_with_neighbour`, all together.
+    """
+    trial, found = maps.followed_together(z, flags, p, TRIALS_TOGETHER)
+    left = np.flatnonzero(~found)
+    detours = list(_detours(maps.orders, maps.flags(z[:, left], p), flags[:, left], 2)) if left.size else []
+    if not detours:
+        return trial, found
+    count, trials = len(detours), _DETOUR // 5
+    between, good = maps.followed_together(np.tile(z[:, left], count), np.concatenate(detours, axis=1), p, trials)
+    ways = np.flatnonzero(good)
+    ends, good[ways] = maps.followed_together(between[:, ways], flags[:, np.tile(left, count)[ways]], p, trials)
+    for k in reversed(range(count)):  # the first of them that is found
+        own = np.flatnonzero(good[ways] & (ways // left.size == k))
+        trial[:, left[ways[own] % left.size]] = ends[:, own]
+    found[left] = good.reshape(count, -1).any(axis=0)
+    return trial, found
+
+
 def _connected(maps: FlatMaps, flag: Array, p: Array, z: Array, orders: int, trials: int, name: str) -> Array:
     try:
         return _straight(maps, z, flag, p)
@@ -178,12 +199,12 @@ def _straight(maps: FlatMaps, z: Array, flag: Array, p: Array, trials: int = TRI
 
 
 def _detours(orders: tuple[int, ...], origin: Array, goal: Array, count: int) -> Iterator[Array]:
-    """Flags between two others, off the straight line by their distance in one of the derivatives below `count`."""
+    """Flags (nz, ...) between two others, off the straight line by their distance in a derivative below `count`."""
     order = np.concatenate([np.arange(r) for r in orders])
     distance = np.abs(goal - origin)
     for nu in range(1, min(count, max(orders))):
         rows = np.flatnonzero(order == nu)
-        size = float(distance[rows].max(initial=0.0))
+        size = distance[rows].max(axis=0, initial=0.0)
         for row in rows:
             for sign in (1.0, -1.0):
                 detour = 0.5 * (origin + goal)

@@ -21,13 +21,14 @@ from ctrlplan.flatness.along import (
     check_branch,
     connected,
     connected_with_neighbour,
+    connected_with_neighbours,
     grid_of,
     note_of_still,
     on_branch,
     rows_of,
     states_along,
 )
-from ctrlplan.flatness.maps import SINGULAR, FlatMaps, regularity
+from ctrlplan.flatness.maps import SINGULAR, TRIALS_TOGETHER, FlatMaps, regularity
 from ctrlplan.flatness.on_path import FORWARD, CurveMap
 from ctrlplan.flatness.system import FlatSystem
 from ctrlplan.symbolic.tape import Tape
@@ -41,6 +42,9 @@ if TYPE_CHECKING:
 _PERIODIC = 1e-6
 """Difference of states one period apart, relative to their size, that is attributed to rounding."""
 
+
+_STRIDE = 16
+"""Number of flags of a sequence from one to the next from which the states of those between them are predicted."""
 
 _TURN_SAMPLES = 401
 """Times at which angles along a plan are evaluated."""
@@ -239,10 +243,29 @@ class DerivedFlatSystem(FlatSystem):
         values, known = self._checked_jet(jet)
         if not np.isfinite(values).all():
             raise ValueError("jet must be finite, got nan or inf")
+        return self._quantities(values, known, None)
+
+    def feasible_quantities(self, jets: ArrayLike) -> dict[str, Array]:
+        """States, inputs and outputs by name along several plans, nan for those that do not determine them.
+
+        Parameters
+        ----------
+        jets : array_like, shape (order + 1, nflat, nplans, ntime)
+            Derivatives of the flat outputs along each plan, as for `quantities`.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (nplans, ntime)
+        """
+        values, known = self._checked_jet(jets)
+        return self._quantities(values, known, np.repeat(np.arange(values.shape[2]), values.shape[3]))
+
+    def _quantities(self, values: Array, known: bool, groups: NDArray[np.intp] | None) -> dict[str, Array]:
+        """Signals by name of a jet whose last derivatives are known or not; `groups` as for `_states`."""
         below, _, last = rows_of(values, self.orders)
         p = self._values(self.params)
         trailing = below.shape[1:]
-        z = self._states_or_nan(below.reshape(len(below), -1), p)
+        z = self._states_or_nan(below.reshape(len(below), -1), p, groups)
         x = z[: self.maps.nstates]
         if known:
             found = self.signals(x, self.maps.inputs_of(z, last.reshape(len(last), -1), p)[1])
@@ -344,45 +367,104 @@ class DerivedFlatSystem(FlatSystem):
         trailing = below.shape[1:]
         return z[: self.maps.nstates].reshape(-1, *trailing), u.reshape(-1, *trailing)
 
-    def _states(self, flags: Array, p: Array) -> Array:
-        """Extended states (nz, n) of flags (nz, n): the first from the operating point, then neighbour by neighbour.
+    def _states(self, flags: Array, p: Array, groups: NDArray[np.intp] | None = None) -> Array:
+        """Extended states (nz, n) of flags (nz, n), connected with the operating point.
 
-        Angles are continuous from each flag to the next.
+        Those of some flags of a long sequence first, from which those between them are
+        predicted. Angles are continuous from each flag to the next. With `groups` (n,),
+        numbers that increase, nan for all flags of a group of which one is not connected,
+        instead of an error.
         """
-        maps = self.maps
-        z = np.full(flags.shape, np.nan)
-        near, left = maps.start, np.arange(flags.shape[1])
-        while left.size:
-            trial, found = maps.refined(np.repeat(near[:, None], left.size, axis=1), flags[:, left], p)
-            found &= maps.same_side(trial, p)
-            # At rest a state may be one of many with the same flag.
-            for j in np.flatnonzero(found & at_rest(maps.orders, flags[:, left])):
-                found[j] = self._is_regular(trial[:, j], p)
-            z[:, left[found]] = trial[:, found]
-            left = left[~found]
-            if left.size:
-                k = int(left[0])
-                try:
-                    if k:
-                        near = connected_with_neighbour(maps, flags[:, k], p, z[:, k - 1], str(self.name))
-                    else:
-                        near = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
-                except ValueError as error:
-                    raise ValueError(f"{error}{note_of_still(maps.orders, flags[:, k])}") from None
-                z[:, k] = near
-                left = left[1:]
-        z[self._angles] = np.unwrap(z[self._angles])
+        z, count = np.full(flags.shape, np.nan), flags.shape[1]
+        lost = np.zeros(count, dtype=bool)
+        if count > 2 * _STRIDE:
+            nodes = np.append(np.arange(0, count - 1, _STRIDE), count - 1)
+            z[:, nodes] = self._connected(z[:, nodes], flags[:, nodes], p, None if groups is None else groups[nodes])
+            if groups is not None:
+                lost = np.isin(groups, groups[nodes][np.isnan(z[0, nodes])])
+            self._predict(z, flags, ~lost, p)
+        rest = np.flatnonzero(~lost)
+        z[:, rest] = self._connected(z[:, rest], flags[:, rest], p, None if groups is None else groups[rest])
+        z[:, lost] = np.nan
+        finite = np.isfinite(z[0])
+        turning = np.ix_(self._angles, finite)
+        z[turning] = np.unwrap(z[turning])
         return z
 
-    def _states_or_nan(self, flags: Array, p: Array) -> Array:
+    def _predict(self, z: Array, flags: Array, wanted: NDArray[np.bool_], p: Array) -> None:
+        """Fill in extended states (nz, n) that are predicted from the nearest known ones, as long as some are found."""
+        left = np.flatnonzero(wanted & np.isnan(z[0]))
+        known = np.flatnonzero(~np.isnan(z[0]))
+        while left.size:
+            after = np.minimum(np.searchsorted(known, left), known.size - 1)
+            before = np.maximum(after - 1, 0)
+            near = known[np.where(np.abs(known[before] - left) <= np.abs(known[after] - left), before, after)]
+            sources, which = np.unique(near, return_inverse=True)
+            trial, found = self.maps.predicted(z[:, sources], flags[:, sources], flags[:, left], which, p)
+            found = self._determined(trial, found, flags[:, left], p)
+            if not found.any():
+                return
+            z[:, left[found]] = trial[:, found]
+            known, left = np.union1d(known, left[found]), left[~found]
+
+    def _connected(self, z: Array, flags: Array, p: Array, groups: NDArray[np.intp] | None = None) -> Array:
+        """Extended states (nz, n) of flags (nz, n), of which some are known: the others are nan."""
+        maps, z = self.maps, z.copy()
+        left = np.flatnonzero(np.isnan(z[0]))
+        starts = np.repeat(maps.start[:, None], z.shape[1], axis=1)
+        while left.size:
+            trial, found = maps.refined(starts[:, left], flags[:, left], p)
+            found = self._determined(trial, found & maps.same_side(trial, p), flags[:, left], p)
+            z[:, left[found]] = trial[:, found]
+            left = left[~found]
+            if left.size > 1:
+                trial, found = maps.followed_together(starts[:, left], flags[:, left], p, TRIALS_TOGETHER)
+                z[:, left[found]] = trial[:, found]
+                left = left[~found]
+            if not left.size:
+                break
+            if groups is None:
+                k = left[:1]
+                z[:, k] = self._connected_alone(z, flags, int(k[0]), p)[:, None]
+                starts[:, left] = z[:, k]
+                left = left[1:]
+                continue
+            own, first, place = np.unique(groups[left], return_index=True, return_inverse=True)
+            k = left[first]
+            before = np.where(np.isfinite(z[:, k - 1]) & (groups[k - 1] == own) & (k > 0), z[:, k - 1], starts[:, k])
+            trial, found = connected_with_neighbours(maps, flags[:, k], p, before)
+            z[:, k] = np.where(found, trial, np.nan)
+            starts[:, left] = trial[:, place]
+            z[:, np.isin(groups, own[~found])] = np.nan
+            left = np.setdiff1d(left[found[place]], k)
+        return z
+
+    def _connected_alone(self, z: Array, flags: Array, k: int, p: Array) -> Array:
+        """Extended state of one of several flags, connected with the one before it."""
+        maps, name = self.maps, str(self.name)
+        try:
+            if k:
+                return connected_with_neighbour(maps, flags[:, k], p, z[:, k - 1], name)
+            return connected(maps, flags[:, k], p, maps.start, name, np.nan)
+        except ValueError as error:
+            raise ValueError(f"{error}{note_of_still(maps.orders, flags[:, k])}") from None
+
+    def _determined(self, z: Array, found: NDArray[np.bool_], flags: Array, p: Array) -> NDArray[np.bool_]:
+        """Which found states (nz, n) are determined by their flags; at rest many may have the same flag."""
+        found = found.copy()
+        for j in np.flatnonzero(found & at_rest(self.maps.orders, flags)):
+            found[j] = self._is_regular(z[:, j], p)
+        return found
+
+    def _states_or_nan(self, flags: Array, p: Array, groups: NDArray[np.intp] | None = None) -> Array:
         """Extended states (nz, n) of flags (nz, n); nan at rest if they are not determined there."""
         still = at_rest(self.maps.orders, flags)
         z = np.full(flags.shape, np.nan)
         if not still.all():
-            z[:, ~still] = self._states(flags[:, ~still], p)
+            z[:, ~still] = self._states(flags[:, ~still], p, None if groups is None else groups[~still])
         if still.any():
             with suppress(ValueError):
-                z[:, still] = self._states(flags[:, still], p)
+                z[:, still] = self._states(flags[:, still], p, None if groups is None else groups[still])
         return z
 
     def _is_regular(self, z: Array, p: Array) -> bool:

@@ -19,6 +19,9 @@ from ctrlplan.symbolic.tape import Tape
 _SHORTEST = 2.0**-25
 """Smallest step, relative to the length of a path."""
 
+_SHORTEST_TOGETHER = 2.0**-16
+"""The same for many lines, of which those that are given up are tried with detours."""
+
 TRIALS = 2000
 """Maximum number of steps along a path."""
 
@@ -37,6 +40,12 @@ SINGULAR = 1e-8
 _ITERATIONS = 12
 _CONVERGED = 1e-13
 """Newton step in scales after which one more step reaches rounding."""
+
+_CONVERGED_TOGETHER = 1e-8
+"""Newton step, with slopes at its start, after which the error is rounding."""
+
+TRIALS_TOGETHER = 100
+"""Maximum number of steps along each of many lines."""
 
 
 class SingularError(ValueError):
@@ -184,6 +193,8 @@ class FlatMaps:
                 z = z + step
                 size = np.max(np.abs(step) / (scale + np.abs(z)), axis=0)
                 near &= (size < _CONTRACTION * before) | (size < 1e-9)
+                if not near.any():
+                    break
                 if (size < _CONVERGED).all() or (k > 4 and (size >= 0.5 * before).all()):
                     break
                 if k % 5 == 4:  # slow: the slopes have changed
@@ -191,6 +202,22 @@ class FlatMaps:
                 before = size
             found = np.isfinite(size) & (size < 1e-9) & near
         return z, found
+
+    def predicted(
+        self, z: Array, flags: Array, goals: Array, near: NDArray[np.intp], p: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """States (nz, n) of flags `goals` (nz, n) from known ones (nz, k) at the indices `near`, and which were found.
+
+        Those to which Newton's method contracts, near the linear prediction.
+        """
+        with np.errstate(all="ignore"):
+            inverse = np.take(inverses(self.slopes(z, p)), near, axis=2)
+            start = np.take(z, near, axis=1)
+            moved = np.einsum("ijn,jn->in", inverse, goals - np.take(flags, near, axis=1))
+            trial, found = self.refined(start + moved, goals, p, inverse)
+            found &= self._distances(trial, start + moved) <= _MOVED
+            found &= (np.abs(moved) < _LONGEST * np.maximum(self.scales[:, None], np.abs(start))).all(axis=0)
+        return trial, found
 
     def same_side(self, z: Array, p: Array) -> NDArray[np.bool_]:
         """Whether the slopes at states (nz, n) have the orientation of those at the start, or are singular.
@@ -249,6 +276,56 @@ class FlatMaps:
             step *= 2.0
         raise self._singular(z, place, p)
 
+    def followed_together(self, z: Array, flags: Array, p: Array, trials: int) -> tuple[Array, NDArray[np.bool_]]:
+        """States (nz, n) followed from given ones (nz, n) along straight lines to flags (nz, n), and which were found.
+
+        As `followed`, but all lines together.
+        """
+        z, origin = z.copy(), self.flags(z, p)
+        place, step, flag = np.zeros(z.shape[1]), np.ones(z.shape[1]), origin.copy()
+        with np.errstate(all="ignore"):
+            slopes = self.slopes(z, p)
+            signs, inverse = _signs(slopes), inverses(slopes)
+            for _ in range(trials):
+                todo = np.flatnonzero((place < 1.0) & (step > _SHORTEST_TOGETHER))
+                if not todo.size:
+                    break
+                goal = np.minimum(place[todo] + step[todo], 1.0)
+                line = origin[:, todo] + goal * (flags[:, todo] - origin[:, todo])
+                wanted = np.where(goal < 1.0, line, flags[:, todo])
+                moved = np.einsum("ijn,jn->in", inverse[:, :, todo], wanted - flag[:, todo])
+                found, now, good = self._stepped_together(z[:, todo], moved, wanted, signs[todo], p)
+                own = todo[good]
+                z[:, own], flag[:, own], place[own] = found[:, good], wanted[:, good], goal[good]
+                inverse[:, :, own] = inverses(now[:, :, good])
+                step[todo] *= np.where(good, 2.0, 0.5)
+        return z, place >= 1.0
+
+    def _stepped_together(
+        self, z: Array, moved: Array, wanted: Array, signs: Array, p: Array
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """States of the next flags (nz, n), the slopes there, and which steps are not too long; as `_stepped`."""
+        predicted = z + moved
+        found, slopes = predicted.copy(), self.slopes(predicted, p)
+        good = np.asarray((np.abs(moved) < _LONGEST * np.maximum(self.scales[:, None], np.abs(z))).all(axis=0))
+        size, active = np.full(good.size, np.inf), np.flatnonzero(good)
+        for k in range(_ITERATIONS):
+            here = found[:, active]
+            step = np.einsum("ijn,jn->in", inverses(slopes[:, :, active]), wanted[:, active] - self.flags(here, p))
+            found[:, active] = here + step
+            before, size[active] = size[active], self._distances(here + step, here)
+            contracts = (k < 2) | (size[active] < _CONTRACTION * before) | (size[active] < 1e-9)
+            good[active] &= contracts & (self._distances(here + step, predicted[:, active]) <= _MOVED)
+            active = active[good[active]]
+            if not active.size:
+                break
+            slopes[:, :, active] = self.slopes(found[:, active], p)
+            active = active[size[active] >= _CONVERGED_TOGETHER]
+            if not active.size:
+                break
+        good &= size < _CONVERGED_TOGETHER
+        return found, slopes, good & (_signs(slopes) == signs)
+
     def followed_simply(self, z: Array, flag: Array, goal: Array, p: Array) -> Array | None:
         """State at the next flag if one step reaches it; otherwise None."""
         slopes = self.slopes(z, p)
@@ -286,6 +363,11 @@ class FlatMaps:
         """Largest difference of two states, in scales or in magnitudes where these are larger."""
         return float(np.max(np.abs(z - other) / np.maximum(self.scales, np.maximum(np.abs(z), np.abs(other)))))
 
+    def _distances(self, z: Array, other: Array) -> Array:
+        """The same of states (nz, n)."""
+        size = np.maximum(self.scales[:, None], np.maximum(np.abs(z), np.abs(other)))
+        return np.asarray(np.max(np.abs(z - other) / size, axis=0))
+
     def _singular(self, z: Array, place: float, p: Array) -> SingularError:
         """Error that names the entry of z that is not determined."""
         return SingularError(f"{self.weakest(z, p)} is not determined by the flat outputs there", place)
@@ -313,6 +395,11 @@ def _solved(matrix: Array, right: Array) -> Array:
     trailing = right.shape[1:]
     inverse = inverses(np.broadcast_to(matrix, (m, m, *trailing)).reshape(m, m, -1))
     return np.einsum("ijn,jn->in", inverse, right.reshape(m, -1)).reshape(right.shape)
+
+
+def _signs(slopes: Array) -> Array:
+    """Signs of the determinants of matrices (m, m, n); nan where they are not finite."""
+    return np.asarray(np.linalg.slogdet(np.moveaxis(slopes, -1, 0))[0])
 
 
 def inverses(matrices: Array) -> Array:

@@ -26,7 +26,7 @@ from ctrlplan.planning.path_law.vehicle import fastest_segment_law, orders_on_pa
 from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, bottom, scan
 from ctrlplan.planning.time_law import with_fast_time_law
-from ctrlplan.trajectories import PathPlan, Retimed, Trajectory
+from ctrlplan.trajectories import PathPlan, Retimed, Trajectory, WaypointSpline
 from ctrlplan.trajectories.common import Array
 
 if TYPE_CHECKING:
@@ -341,7 +341,9 @@ def fastest(
         raise ValueError(f'ends must be "free" unless hold is "path", without params, got {ends!r} with hold {hold!r}')
     spare, chosen = checked_finite(resolution, "resolution", above=0.0), system_given(system, quantities)
     if not params:
-        return fastest_under(plan, Limited(plan, limits, chosen, tail), hold, span, spare, ends)
+        limited = Limited(plan, limits, chosen, tail)
+        with limited.naming_plants():
+            return fastest_under(plan, limited, hold, span, spare, ends)
     from ctrlplan.planning.parameters import Family
     from ctrlplan.planning.robust import fastest_over
 
@@ -366,6 +368,8 @@ def fastest_under(
         limited.check_smooth(plan)
     if not _moves(plan):
         raise ValueError(f"plan must move, got constant axes: {plan!r}")
+    if hold == "waypoints" and isinstance(plan, WaypointSpline):
+        _check_waypoints(plan, limited)
     found = _fastest(plan, limited, hold, span, resolution, ends)
     _check_not_vanishing(plan, found)
     return found
@@ -435,6 +439,21 @@ def _with_given_speeds(plan: Trajectory, limited: Limited, span: tuple[float, fl
         plan, limited, span, partial(law_with_given_ends, plan.shift(-plan.start), limited, plan.start)
     )
     return Fastest(found, margins, ((found.duration, found.duration),), "path", limited, statement=_LOCAL)
+
+
+def _check_waypoints(plan: WaypointSpline, limited: Limited) -> None:
+    """Raise for derivatives that waypoints prescribe, at every duration, and that violate a limit."""
+    for bound in limited.bounds:
+        if bound.axis is None or not bound.is_constant:
+            continue
+        for point in plan.waypoints:
+            value = float(point.jet[bound.order, bound.axis]) if bound.order < len(point.jet) else math.nan
+            if bound.excess(np.array([value]))[0] > _AT_ENDS:
+                further = '; or use hold="shape", which scales the derivatives' if bound.order else ""
+                raise ValueError(
+                    f"limits must be satisfied at the waypoints, at any duration, got {bound.name} "
+                    f"= {value:.6g} of the waypoint at {point.time:.6g} s, where it must be {bound.range}{further}"
+                )
 
 
 def _check_not_vanishing(plan: Trajectory, found: Fastest) -> None:
@@ -848,7 +867,13 @@ def _span(scaled: PlansByDuration | _InLoop, duration: float, minimum: float) ->
     while low > minimum and excess(low) <= 0.0:
         low /= 64.0
         if low < 1e-12 * high:
-            raise ValueError("limits must include one that a shorter plan would violate, got none")
+            further = (
+                f": a plan of {low:.3g} s satisfies all of them; pass durations=(low, high) for a search between two "
+                "durations"
+                if isinstance(scaled, _InLoop)
+                else ""
+            )
+            raise ValueError(f"limits must include one that a shorter plan would violate, got none{further}")
     return max(low, 0.999 * minimum), 1.01 * high
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -11,13 +12,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctrlplan._checks import check_kind
+from ctrlplan._checks import check_kind, checked_finite
 from ctrlplan._display import Displayed, Facts, Part, Table, counted
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.naming import Naming
 from ctrlplan.planning.path_law.positions import maximum_excess
-from ctrlplan.planning.quantities import Response, System, loop_of, path_quantities, quantities_of, system_given
+from ctrlplan.planning.quantities import (
+    Response,
+    System,
+    feasible_quantities_of,
+    loop_of,
+    path_quantities,
+    quantities_of,
+    system_given,
+)
 from ctrlplan.planning.window import mean_square, window
 from ctrlplan.trajectories import PathPlan, Retimed, Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
@@ -265,7 +274,8 @@ def margins(
         return margins_over(plan, limits, Family.of(system_given(system, quantities), params), tail)
     limited = Limited(plan, limits, system_given(system, quantities), tail)
     limited.check_smooth(plan)
-    return limited.margins(plan)
+    with limited.naming_plants():
+        return limited.margins(plan)
 
 
 def _listed(parameters: Mapping[str, float]) -> str:
@@ -318,12 +328,15 @@ class Limited:
         if not plan.duration:
             raise ValueError("a plan under limits must have a duration, got a step")
         check_kind(limits, "limits", Mapping, "a mapping of names to limits")
+        if tail is not None:
+            checked_finite(tail, "tail", minimum=0.0)
         self._start, self._duration = plan.start, plan.duration
         self._given = limits, system, tail
         self.loop = loop_of(system, tail)
         self._at_positions = False
         self._on_path = path_quantities(system, plan)
         self._quantities = self._on_path or (None if self.loop is not None else quantities_of(system))
+        self._together = None if self._on_path is not None else feasible_quantities_of(system)
         self.bounds = tuple(Naming(self.seen(plan), self._quantities, self.loop, plan.naxes).bounds(limits))
         if not self.bounds:
             raise ValueError("limits must name at least one signal, got none")
@@ -336,6 +349,22 @@ class Limited:
         self.is_constant = all(bound.is_constant and not bound.in_loop for bound in self.bounds)
         self.bounds = tuple(self._scaled(bound) for bound in self.bounds)
         self.bounds = tuple(self._slackened(plan))
+
+    @contextmanager
+    def naming_plants(self) -> Iterator[None]:
+        """Errors that say how to pass a plant, if an input of what was taken for a loop is limited."""
+        try:
+            yield
+        except ValueError as error:
+            inputs = set() if self.loop is None else set(self.loop.inputs)
+            limited = [name for bound in self.loop_bounds for name in bound.weights if name in inputs]
+            if not limited:
+                raise
+            raise ValueError(
+                f"{error}; system was taken for a loop with the plan as input {limited[0]}: for limits on the inputs "
+                "and states of a plant whose outputs are planned, pass its flat system, as system=cp.flat_system("
+                "plant, flat_outputs)"
+            ) from error
 
     def of(self, plan: Trajectory) -> Limited:
         """The same limits for plans of another path."""
@@ -412,11 +441,24 @@ class Limited:
                 )
         return rows
 
-    def _rows(self, jet: Array, chosen: Sequence[int]) -> Array:
-        """Limited signals, nan where the plan does not determine them."""
+    def _values_of_plans(self, jets: Array) -> Array:
+        """Limited signals (nbounds, nplans, ntime) of jets (order + 1, naxes, nplans, ntime).
+
+        Of a plan that is infeasible for the plant nan, or an error.
+        """
+        jet = jets.reshape(*jets.shape[:2], -1)
+        if self._together is None or any(self.bounds[k].kind == "rate" for k in self._local):
+            rows = self.values(jet)
+        else:
+            signals = {} if self.derivatives_only else self._together(jets)
+            rows = self._rows(jet, self._local, {name: values.ravel() for name, values in signals.items()})
+        return rows.reshape(len(self.bounds), *jets.shape[2:])
+
+    def _rows(self, jet: Array, chosen: Sequence[int], known: Mapping[str, Array] | None = None) -> Array:
+        """Limited signals, nan where the plan does not determine them; of `known` quantities if they are given."""
         rows = np.zeros((len(self.bounds), jet.shape[2]))
         kinds = {self.bounds[k].kind == "rate" and self.bounds[k].axis is None for k in chosen}
-        signals = self._signals(jet) if False in kinds else {}
+        signals = known if known is not None else self._signals(jet) if False in kinds else {}
         rates = self._rates(jet) if True in kinds else {}
         for k in chosen:
             b = self.bounds[k]
@@ -486,7 +528,7 @@ class Limited:
         try:
             if not together:
                 raise ValueError("one duration after the other")
-            values = self.values(jets.reshape(*jets.shape[:2], -1)).reshape(len(self.bounds), *jets.shape[2:])
+            values = self._values_of_plans(jets)
         except ValueError:  # infeasible for the plant at one of the durations, such as a rope under compression
             if durations.size == 1:
                 return np.full(1, math.inf)

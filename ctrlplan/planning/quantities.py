@@ -161,8 +161,17 @@ def quantities_of(system: Any) -> Quantities | None:
             return system
     raise TypeError(
         "system must be a flat system, a plant with a method quantities (as Crane has), a loop, or a function of a "
-        f"jet, got {system.__name__ if isinstance(system, type) else type(system).__name__}"
+        f"jet, got {f'the class {system.__name__}' if isinstance(system, type) else type(system).__name__}"
     )
+
+
+def feasible_quantities_of(system: Any) -> Quantities | None:
+    """Function from jets of several plans to signals that are nan for infeasible plans; None if there is none.
+
+    The shapes are (order + 1, naxes, nplans, ntime) and (nplans, ntime).
+    """
+    own = getattr(system, "feasible_quantities", None)
+    return own if callable(own) and not isinstance(system, type) else None
 
 
 def path_quantities(system: Any, plan: Trajectory) -> HasRates | None:

@@ -33,11 +33,20 @@ _ORDERS = (3, 4, 6, 8, 12, 16)
 _RESOLVED = 4e-16
 """Last Legendre coefficients, relative to a signal, at which it counts as resolved."""
 
+_ALMOST = 1e-14
+"""The same with the largest number of nodes, where it may be rounding, to which halves of an interval would not add."""
+
 _PROBES = 64
-"""Number of intervals in which the number of nodes is chosen first."""
+"""Number of intervals of each kind (longest, shortest, any) in which the number of nodes is chosen first."""
 
 _PARTS = 2**12
 """Maximum number of parts into which an interval is divided to resolve the functions of time."""
+
+_FEW = 256
+"""Maximum number of spans that are halved by themselves where functions of time are not resolved."""
+
+_HALVINGS = 12
+"""Maximum number of times."""
 
 _NOISE, _FALLING = 1e-11, 4.0
 """Size of the last coefficients below which they are rounding, unless more nodes decrease them by this factor."""
@@ -501,12 +510,15 @@ class _Spans:
         Intervals that have parts.
     """
 
-    def __init__(self, instants: Instants, last: float, fed: _Chosen, tolerance: float) -> None:
+    def __init__(
+        self, instants: Instants, last: float, fed: _Chosen, tolerance: float, further: Array | None = None
+    ) -> None:
         self.instants, self._last, self._fed, self.tolerance = instants, last, fed, tolerance
+        self._further = np.zeros(0) if further is None else further
         begin, end = instants.times, np.append(instants.times[1:], max(last, float(instants.times[-1])))
         self.different = np.append(instants.lengths, end[-1] - begin[-1])
         self.length_of = np.append(instants.which, instants.lengths.size)
-        marks = fed.breakpoints_between(float(begin[0]), float(end[-1]))
+        marks = np.union1d(fed.breakpoints_between(float(begin[0]), float(end[-1])), self._further)
         marks = marks[(marks > begin[0] + tolerance) & (marks < end[-1] - tolerance)]
         marks = marks[np.append(True, np.diff(marks) > tolerance)[: marks.size]]
         where = np.searchsorted(begin, marks, side="right") - 1
@@ -526,27 +538,49 @@ class _Spans:
         """The same with each interval divided into equal ones."""
         return _Spans(self.instants.divided(parts), self._last, self._fed, self.tolerance)
 
+    def halved(self, chosen: NDArray[np.intp]) -> _Spans:
+        """The same with some spans halved."""
+        middle = self.starts[chosen] + 0.5 * self.lengths[chosen]
+        further = np.union1d(self._further, middle)
+        return _Spans(self.instants, self._last, self._fed, self.tolerance, further)
+
 
 def _resolved(spans: _Spans, fed: _Chosen) -> tuple[_Spans, Array]:
     """Spans, divided if necessary, and values (nspans, order * ncolumns) at Gauss nodes that resolve the signals."""
     if not fed.columns.size:
         return spans, np.zeros((spans.starts.size, 0))
-    parts, divided = 1, spans
+    parts, divided, halvings = 1, spans, 0
     while True:
         used = np.flatnonzero(divided.lengths > divided.tolerance)
         some = used[np.unique(np.linspace(0, used.size - 1, min(_PROBES, used.size)).astype(int))]
-        longest = used[np.argsort(-divided.lengths[used])[:_PROBES]]
+        by_length = used[np.argsort(divided.lengths[used], kind="stable")]
+        longest, shortest = by_length[-_PROBES:], by_length[:_PROBES]
         # Times are rounded: relative to the change of a signal over a span by this much.
         largest = float(np.abs(divided.starts).max() / divided.lengths.max(initial=1e-300))
         noise = _NOISE + 64.0 * np.finfo(float).eps * largest
-        for order, limit in _orders(divided, fed, np.union1d(some, longest), noise):
+        for order, limit in _orders(divided, fed, np.unique(np.concatenate([some, longest, shortest])), noise):
             values = fed.at(divided.starts[:, None] + divided.lengths[:, None] * gauss_nodes(order))
             if _tail(values, order) <= limit:
                 return divided, values
+        few = _unresolved(divided, fed)
+        if few.size <= _FEW and parts == 1 and halvings < _HALVINGS:
+            divided, halvings = divided.halved(few), halvings + 1
+            continue
         if parts >= _PARTS:
             raise NotApplicableError("a function of time is not resolved between the sample times of the loop")
         parts *= 2
         divided = spans.divided(parts)
+
+
+def _unresolved(spans: _Spans, fed: _Chosen) -> NDArray[np.intp]:
+    """Spans in which the largest number of nodes does not resolve the signals."""
+    order = _ORDERS[-1]
+    values = fed.at(spans.starts[:, None] + spans.lengths[:, None] * gauss_nodes(order))
+    width = values.shape[1] // order
+    size = _largest(values).reshape(-1, width).max(axis=0)
+    last = np.abs(values @ np.kron(to_legendre(order)[-2:].T, np.eye(width))).reshape(len(values), -1, width)
+    wrong = (last > _RESOLVED * np.where(size > 0.0, size, 1.0)).any(axis=(1, 2))
+    return np.flatnonzero(wrong & (spans.lengths > spans.tolerance))
 
 
 def _orders(spans: _Spans, fed: _Chosen, some: NDArray[np.intp], noise: float) -> list[tuple[int, float]]:
@@ -559,7 +593,7 @@ def _orders(spans: _Spans, fed: _Chosen, some: NDArray[np.intp], noise: float) -
         if before <= noise and tail > before / _FALLING:  # more nodes do not reduce rounding errors of the signals
             return [(_ORDERS[k - 1], noise)]
         before = tail
-    return []
+    return [(_ORDERS[-1], _ALMOST)] if before <= _ALMOST else []
 
 
 def _tail(values: Array, order: int) -> float:

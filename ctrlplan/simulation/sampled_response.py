@@ -25,7 +25,7 @@ from ctrlplan.simulation.loop_inputs import fed_signals, is_cyclic, tracked
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse, LoopSignals, signal_names
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.sampled_form import SampledForm
-from ctrlplan.simulation.sampled_motion import moved_signals
+from ctrlplan.simulation.sampled_motion import SampledMotion, moved_signals
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal
 from ctrlplan.simulation.simulated_response import LoopInputs, SimulatedResponse, check_sources
 from ctrlplan.trajectories import Trajectory
@@ -144,10 +144,22 @@ class SampledResponse(LoopResponse):
         given = prepared.time_signals([PlanSignal(fed)] if inputs else [], plan.start)
         self._w = [np.concatenate([np.zeros(0), *(_held(signal, last) for signal in given)]) for last in (False, True)]
         self._start = self._at_rest()
-        used: NDArray[np.bool_] = np.any(self._d != 0.0, axis=0)
-        self._last, self._decay = plan.end + decay.time, decay
-        state = self._start[: form.nstates]
-        self._motion = moved_signals(form, given, plan.start, self._last, state, used)[1]
+        self._last, self._decay, self._given = plan.end + decay.time, decay, given
+        self._motion = self._moved(np.any(form.d != 0.0, axis=0))
+
+    def _moved(self, used: NDArray[np.bool_]) -> SampledMotion:
+        """States over the run, and the `used` functions of time between samples."""
+        state = self._start[: self._form.nstates]
+        return moved_signals(self._form, self._given, self._plan.start, self._last, state, used)[1]
+
+    @cached_property
+    def _motion_with_inputs(self) -> SampledMotion:
+        """The same with all functions of time, for limits on inputs, which discrete blocks read at samples only."""
+        return self._moved(np.ones(self._d.shape[1], dtype=bool))
+
+    def _motion_of(self, d: Array) -> SampledMotion:
+        """Motion with the functions of time that a row d of a signal weighs."""
+        return self._motion_with_inputs if (d[~np.any(self._form.d != 0.0, axis=0)] != 0.0).any() else self._motion
 
     def extremes(
         self,
@@ -234,15 +246,16 @@ class SampledResponse(LoopResponse):
     def _cells(self, weights: Mapping[str, float], rate: bool, until: float = math.inf) -> Cells:
         c, d = self._sum(weights)
         if not rate:
-            return self._motion.signal_cells(c[None], d[None], until)
+            return self._motion_of(d).signal_cells(c[None], d[None], until)
         moving = self._form.moving
         if not c[moving].any() and not d.any():
             return self._held_rate(weights, c)
-        self._check_continuous(weights, self._motion.signal_cells(c[None], d[None]))
-        found = self._motion.signal_cells((c[moving] @ self._form.a)[None], (c[moving] @ self._form.b)[None])
+        motion = self._motion_of(d)
+        self._check_continuous(weights, motion.signal_cells(c[None], d[None]))
+        found = motion.signal_cells((c[moving] @ self._form.a)[None], (c[moving] @ self._form.b)[None])
         if not d.any():
             return found
-        direct = self._motion.signal_cells(np.zeros((1, c.size)), d[None])
+        direct = motion.signal_cells(np.zeros((1, c.size)), d[None])
         series = np.zeros((max(len(found.series), len(direct.series)), 1, found.starts.size))
         series[: len(found.series)] = found.series
         slope = chebyshev.chebder(direct.series, axis=0)

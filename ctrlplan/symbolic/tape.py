@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,12 +28,11 @@ INPUT, CONSTANT = "INPUT", "CONST"
 
 @dataclass(frozen=True)
 class Instruction:
-    """Operation, places of its arguments, its constant, and the places that no later instruction reads."""
+    """Operation, places of its arguments, and its constant."""
 
     operation: str
     arguments: tuple[int, ...]
     constant: float = 0.0
-    last_reads: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,35 +120,54 @@ class Tape:
         constant : callable, optional
             Number of a constant.
         """
-        values: list[Value] = []
-        for step in instructions_of(self):
-            if step.operation == INPUT:
-                argument, entry = step.arguments
-                values.append(arguments[argument][entry])
-            elif step.operation == CONSTANT:
-                values.append(constant(step.constant))
-            else:
-                values.append(operations[step.operation](*[values[place] for place in step.arguments]))
-                for place in step.last_reads:  # their memory is used again
-                    values[place] = None
+        program = _program_of(self)
+        functions = [_not_evaluated if name in (INPUT, CONSTANT) else operations[name] for name in self.operations]
+        values: list[Value] = [None] * len(self.code)
+        for place, argument, entry in program.inputs:
+            values[place] = arguments[argument][entry]
+        for place, number in program.constants:
+            values[place] = constant(number)
+        for place, operation, first, second, last_reads in program.steps:
+            function = functions[operation]
+            values[place] = function(values[first]) if second < 0 else function(values[first], values[second])
+            for read in last_reads:  # their memory is used again
+                values[read] = None
         return values
 
 
+def _not_evaluated(*values: Value) -> Value:
+    """In place of the function of an input or a constant."""
+    raise TypeError("inputs and constants are no operations")
+
+
+class _Program(NamedTuple):
+    """Instructions of a tape: inputs (place, argument, entry), constants, and operations.
+
+    Of an operation the place of its result, its number, the places of its arguments,
+    the second -1 for none, and those that are read no more.
+    """
+
+    inputs: tuple[tuple[int, int, int], ...]
+    constants: tuple[tuple[int, float], ...]
+    steps: tuple[tuple[int, int, int, int, tuple[int, ...]], ...]
+
+
 @lru_cache(maxsize=512)
-def instructions_of(tape: Tape) -> tuple[Instruction, ...]:
+def _program_of(tape: Tape) -> _Program:
     """Instructions of a tape, with the places that each reads last."""
     seen = set(tape.results.tolist())
-    out: list[Instruction] = []
-    for row, constant in zip(tape.code[::-1].tolist(), tape.constants[::-1].tolist(), strict=True):
-        name = tape.operations[row[0]]
-        places = tuple(place for place in row[1:] if place >= 0)
-        if name in (INPUT, CONSTANT):
-            out.append(Instruction(name, places, constant))
-            continue
-        new = tuple(sorted(set(places) - seen))
-        seen.update(new)
-        out.append(Instruction(name, places, constant, new))
-    return tuple(reversed(out))
+    inputs, constants, steps = [], [], []
+    for place, (operation, first, second) in reversed(list(enumerate(tape.code.tolist()))):
+        name = tape.operations[operation]
+        if name == INPUT:
+            inputs.append((place, first, second))
+        elif name == CONSTANT:
+            constants.append((place, float(tape.constants[place])))
+        else:
+            new = tuple(sorted({first, second} - seen - {-1}))
+            seen.update(new)
+            steps.append((place, operation, first, second, new))
+    return _Program(tuple(inputs), tuple(constants), tuple(reversed(steps)))
 
 
 NUMPY: Operations = {

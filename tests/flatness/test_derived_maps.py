@@ -589,3 +589,33 @@ def test_flags_states_and_jets_of_wrong_sizes():
         flat.forward(np.zeros(3), np.zeros(2))
     with pytest.raises(ValueError, match="jet must be finite"):
         flat.quantities(np.full((5, 2, 3), np.nan))
+
+
+def test_many_flags_together_have_the_states_of_formulas():
+    """More flags than are connected one by one, of a plan far from the operating point, in any order."""
+    quadrotor = cp.plants.PlanarQuadrotor(mass=1.0)
+    flat = cp.flat_system(quadrotor.iosystem(), ["x", "z"], at={"theta": 0.0})
+    plan = rest_to_rest(["x", "z"], [4, 4], [3.0, 1.0], 1.0)
+    jet = plan.jet(np.linspace(0.0, 1.0, 700), 4)
+    order = np.random.default_rng(0).permutation(700)
+    known = quadrotor.flat_system().quantities(jet)
+    for found, places in ((flat.quantities(jet), slice(None)), (flat.quantities(jet[:, :, order]), order)):
+        for name in ("theta", "theta_d1", "left", "right"):
+            wanted = known[name][places]
+            np.testing.assert_allclose(found[name], wanted, rtol=0.0, atol=1e-10 * np.abs(wanted).max())
+
+
+@pytest.mark.slow
+def test_of_several_plans_those_that_the_plant_cannot_follow_are_nan():
+    """A crane whose load would fall faster than g: the rope length of the continuous states would be infinite."""
+    crane = cp.plants.Crane()
+    flat = cp.flat_system(crane.iosystem(), ["x", "z"], at={"R": 10.0}, params={"load_mass": crane.load_mass})
+    plan = rest_to_rest(["x", "z"], [4, 4], [20.0, 8.0], 15.0, [0.0, 10.0])
+    plans = [plan.retime(duration) for duration in (0.8, 15.0, 9.0)]
+    jets = np.stack([one.jet(one.start + one.duration * np.linspace(0.0, 1.0, 24), 4) for one in plans], axis=2)
+    found = flat.feasible_quantities(jets)["F"]
+    with pytest.raises(ValueError, match="taut"):
+        crane.quantities(jets[:, :, 0])
+    assert np.isnan(found[0]).any()
+    for k in (1, 2):
+        np.testing.assert_allclose(found[k], crane.quantities(jets[:, :, k])["F"], rtol=1e-9, atol=1e-6)

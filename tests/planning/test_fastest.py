@@ -568,9 +568,10 @@ def test_a_search_that_ends_where_limits_come_nearer_says_so():
         found = fastest(far, {"velocity": 0.2}, hold="waypoints", durations=durations)
         # y' is 0.1 at the ends and 1.5 d/T - 0.05 in the middle.
         assert found.duration == pytest.approx(1.5 * 20 / 0.25, rel=1e-9)
-    inside = cp.PolySpline([Waypoint(0, 0, 1, 0), Waypoint(1, 1, 1, 0)])
-    with pytest.raises(ValueError, match=r"got none; nearest at [0-9.]+ s: y_d1 within ±0.9: [^;]*$"):
-        fastest(inside, {"velocity": 0.9, "y_d2": 1.0}, hold="waypoints", durations=(0.5, 50.0))
+    # It arrives from above, from at least 1 + 1/(2 * 1): between very short and very long durations is the nearest.
+    inside = cp.PolySpline([Waypoint(0, 0, 1, 0), Waypoint(1, 1, -1, 0)])
+    with pytest.raises(ValueError, match=r"got none; nearest at [0-9.]+ s: y[^;]*$"):
+        fastest(inside, {"y": (-0.1, 1.05), "y_d2": 1.0}, hold="waypoints", durations=(0.1, 50.0))
 
 
 # The report
@@ -687,3 +688,43 @@ def test_a_plan_that_is_infeasible_for_the_plant_at_every_duration_says_why(dura
     plan = cp.PolySpline([cp.Waypoint(0, 0.2, 0, 0), cp.Waypoint(9, -0.1, 0, 0)], labels=["h2"])
     with pytest.raises(ValueError, match=begin + "states of tanks must .* h1 is not determined by the flat outputs"):
         cp.fastest(plan, {"q": 1.0}, flat, durations=durations)
+
+
+HIGH = [Waypoint.from_jets(t, x=[x, 0, 0, 0, 0], z=[z, 0, 0, 0, 0]) for t, x, z in ((0, 0, -10), (15, 20, -8))]
+
+
+@pytest.mark.parametrize("function", [fastest, margins])
+def test_a_load_above_the_trolley_is_rejected(function):
+    with pytest.raises(ValueError, match=r"rope length R must be above 0, got .* m.*below the trolley"):
+        function(cp.PolySpline(HIGH), {"F": 5e3}, cp.plants.Crane())
+
+
+def test_a_plan_that_winds_up_the_rope_is_rejected_at_every_duration():
+    ends = [Waypoint.from_jets(t, x=[x, 0, 0, 0, 0], z=[z, 0, 0, 0, 0]) for t, x, z in ((0, 0, 10), (15, 20, -1))]
+    with pytest.raises(ValueError, match="rope length R must be above 0"):
+        fastest(cp.PolySpline(ends), {"F": 5e3}, cp.plants.Crane())
+
+
+@pytest.mark.parametrize("limits", [{"velocity": 1.0}, {"velocity": 10.0, "acceleration": 2.0}])
+def test_waypoints_that_violate_limits_at_every_duration_are_named(limits):
+    moving = cp.PolySpline([Waypoint(0, 0, 3.0, 5.0), Waypoint(1, 1, 0, 0)])
+    with pytest.raises(
+        ValueError, match=r"at the waypoints, at any duration, got y_d[12] = [35] of the waypoint at 0 s"
+    ):
+        fastest(moving, limits, hold="waypoints")
+
+
+def test_a_plant_in_place_of_its_flat_system_is_named():
+    plan = cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)])
+    double = ct.ss([[0, 1], [0, 0]], [[0], [1]], np.eye(2), 0, inputs="u", outputs=["y", "v"], name="double")
+    with pytest.raises(ValueError, match=r"taken for a loop with the plan as input u.* system=cp\.flat_system\("):
+        fastest(plan, {"u": 5.0}, double)
+    with pytest.raises(TypeError, match="got the class Crane"):
+        fastest(plan, {"F": 5.0}, cp.plants.Crane)
+
+
+@pytest.mark.parametrize("tail", [-1.0, float("nan")])
+def test_a_tail_is_checked_without_a_loop(tail):
+    plan = cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)])
+    with pytest.raises(ValueError, match="tail must be"):
+        fastest(plan, {"velocity": 1.0}, tail=tail)

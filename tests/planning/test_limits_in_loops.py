@@ -280,6 +280,37 @@ def test_the_fastest_move_of_a_sampled_loop():
     assert y.max() <= 1.3 + 1e-5
 
 
+def test_a_plan_shorter_than_the_sampling_period_is_a_step():
+    """Samples see the start and the end of the plan only, whatever happens between them."""
+    dt = 0.2
+    shape = cp.TrigSpline(
+        [Waypoint(0, 0, 0, 0, 0), Waypoint(1, 1), Waypoint(2, 0.5), Waypoint(3, 1, 0, 0, 0)], alpha=4.0
+    )
+    held, outputs, x = 0.0, [], np.zeros(2)
+    step = expm(np.array([[0.0, 1.0, 0.0], [0.0, -2.0, 2.0], [0.0, 0.0, 0.0]]) * dt / 64)
+    for k in range(20):
+        held = 8.0 * (float(k > 0) - x[0])
+        for _ in range(64):
+            x = (step @ np.append(x, held))[:2]
+            outputs.append(x[0])
+    for duration in (0.19, 0.02, 1e-3, 1e-5):
+        row = only(margins(shape.retime(duration), {"y": (None, 3.0)}, sampled_loop(dt)))
+        assert row.value == pytest.approx(max(outputs), abs=1e-4)
+    with pytest.raises(ValueError, match=r"a plan of .* s satisfies all of them; pass durations="):
+        fastest(TRACK, {"u": 1e3}, sampled_loop(dt))
+
+
+def test_short_plans_into_the_continuous_part_of_a_sampled_loop():
+    """An acceleration feedforward that is not sampled: a double integrator follows, whatever the sampling period."""
+    plant = ct.ss([[0, 1], [0, 0]], [[0, 0], [1, 1]], [[1, 0]], 0, inputs=["u", "r_d2"], outputs="y", name="plant")
+    law = ct.ss([[0.0]], [[1.0, -1.0]], [[-1.0]], [[1.5, -1.5]], 0.2, inputs=["r", "y"], outputs="u", name="law")
+    loop = ct.interconnect([plant, cp.sample_hold(law, 0.2)], inputs=["r", "r_d2"], outputs=["y", "u"], name="loop")
+    for duration in (1.0, 0.05, 1e-3):
+        found = by_name(margins(TRACK.retime(duration), {"y": (None, 1.5), "u": 1.0}, loop))
+        assert found["y"].value == pytest.approx(1.0, abs=1e-9)
+        assert found["u"].value == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_discrete_loop_is_evaluated_at_its_samples():
     """y[k+1] = 0.7 y[k] + 0.3 r[k]."""
     loop = ct.ss([[0.7]], [[0.3]], [[1.0], [-1.0]], [[0.0], [1.0]], 0.1, inputs="r", outputs=["y", "e"], name="lag")

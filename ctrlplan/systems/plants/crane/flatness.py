@@ -18,7 +18,7 @@ from ctrlplan.systems import series
 from ctrlplan.systems.plants.closed_form import ClosedFormFlatSystem
 from ctrlplan.systems.plants.crane import model
 from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
-from ctrlplan.systems.plants.crane.rope import check_taut
+from ctrlplan.systems.plants.crane.rope import check_below, check_taut
 from ctrlplan.systems.plants.parameters import defaults_of
 from ctrlplan.systems.series import Taylor
 from ctrlplan.traits import declare
@@ -85,8 +85,9 @@ def quantities(crane: CraneParameters, jet: ArrayLike) -> dict[str, Array]:
     Raises
     ------
     ValueError
-        If the order is below 2, or g - z'' is not positive everywhere: the rope
-        cannot push.
+        If the order is below 2; if g - z'' is not positive everywhere, since the rope
+        cannot push, or the rope length R is not, since the load must hang below the
+        trolley.
     """
     values = np.asarray(jet, dtype=float)
     if values.ndim < 2 or values.shape[1] != 2 or len(values) < 3:
@@ -120,10 +121,13 @@ def reverse(
 
 
 def checked_formulas(numbers: Numbers, rope_wrap: bool, jet: Array) -> dict[str, Array]:
-    """`formulas`, for numbers after the check of a taut rope."""
-    if jet.dtype != object:
-        check_taut(numbers[6] - jet[2, 1])
-    return formulas(numbers, rope_wrap, jet)
+    """`formulas`, for numbers with the checks of a taut rope and of its length."""
+    if jet.dtype == object:
+        return formulas(numbers, rope_wrap, jet)
+    check_taut(numbers[6] - jet[2, 1])
+    found = formulas(numbers, rope_wrap, jet)
+    check_below(found["R"])
+    return found
 
 
 def formulas(numbers: Numbers, rope_wrap: bool, jet: Array) -> dict[str, Array]:
@@ -179,8 +183,7 @@ def check(crane: CraneParameters, plan: Trajectory) -> None:
         shortest, time = float(min(plan.initial[1], plan.final[1])), plan.start
     else:
         shortest, time = _shortest_rope(crane, plan, fall)
-    if not shortest > 0.0:
-        raise ValueError(f"the rope length R must be above 0, got {shortest:.4g} m at {time:.4g} s")
+    check_below(shortest, f" at {time:.4g} s")
 
 
 def check_axes(plan: Trajectory) -> None:

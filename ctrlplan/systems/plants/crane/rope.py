@@ -25,6 +25,16 @@ def check_taut(hanging: Array | float, place: str = "") -> None:
         raise ValueError(f"g - z'' must be above 0 for a taut rope, got {lowest:.4g} m/s^2{place}")
 
 
+def check_below(lengths: Array | float, place: str = "") -> None:
+    """Raise unless the rope length R [m] is positive: the load hangs below the trolley."""
+    shortest = float(np.min(lengths, initial=np.inf))
+    if not shortest > 0.0:
+        raise ValueError(
+            f"the rope length R must be above 0, got {shortest:.4g} m{place}: z points down, and the load must stay "
+            "below the trolley"
+        )
+
+
 @dataclass(frozen=True)
 class CraneRope:
     """Straight rope from the load to its point of tangency at the drum.
