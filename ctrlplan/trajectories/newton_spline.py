@@ -230,7 +230,12 @@ class NewtonSpline(WaypointSpline):
             rows = self.segment_rows(segment, float(s[0]), order)
             if rows is not None:
                 return np.array(rows).T[:, :, None]
-        return self._jet(s, order)
+        found = self._jet(s, order)
+        for end in (0.0, self._moments[1] - self._moments[0]):
+            where = (s == end).nonzero()[0]
+            if where.size:
+                found[:, :, where] = self._end_jet(segment, end, order)[:, :, None]
+        return found
 
     def _jet(self, s: Array, order: int) -> Array:
         """Derivatives (order + 1, naxes, ntime) at times since the start."""

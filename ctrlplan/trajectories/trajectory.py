@@ -1168,10 +1168,10 @@ class Trajectory(Displayed, Fields, ABC):
         high = low + len(out) - 1
         length = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
         finite = _sampling.sample(jet, self._interpolant(segment, low, high), length, s, (low, high), out)
-        for k in (0, -1):  # the ends have the entries of waypoints in every bit
-            end = float(s[k])
-            if end in (0.0, length):
-                out[:, :, k] = self._end_jet(segment, end, high)[low:]
+        for end in (0.0, length):  # the ends have the entries of waypoints in every bit
+            where = (s == end).nonzero()[0]
+            if where.size:
+                out[:, :, where] = self._end_jet(segment, end, high)[low:, :, None]
         return finite
 
     def _interpolant(self, segment: int, low: int, high: int) -> _sampling.Interpolant | None:
