@@ -412,9 +412,9 @@ def test_a_closed_plan_stays_closed(name, hold):
     assert jet[2] <= 3.0 * (1 + 1e-11)
 
 
-def test_a_time_law_with_a_limited_fifth_derivative_would_open_a_closed_plan():
+def test_a_time_law_with_a_limited_sixth_derivative_would_open_a_closed_plan():
     with pytest.raises(ValueError, match="hold must be 'shape' or 'waypoints' for a closed plan, got 'path'"):
-        fastest(CYCLE, {"velocity": 2.0, "y1_d5": 3e4}, hold="path")
+        fastest(CYCLE, {"velocity": 2.0, "y1_d6": 3e6}, hold="path")
 
 
 @pytest.mark.slow
