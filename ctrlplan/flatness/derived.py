@@ -246,7 +246,7 @@ class DerivedFlatSystem(FlatSystem):
         return self._quantities(values, known, None)
 
     def feasible_quantities(self, jets: ArrayLike) -> dict[str, Array]:
-        """States, inputs and outputs by name along several plans, nan for those that do not determine them.
+        """Signals by name along several plans, nan where undetermined.
 
         Parameters
         ----------

@@ -137,7 +137,7 @@ class Waypoint(Displayed, Fields):
         return self
 
     @classmethod
-    def of_checked(cls, time: float, jet: Array, labels: tuple[str, ...] | None, complete: bool) -> Waypoint:
+    def _of_checked(cls, time: float, jet: Array, labels: tuple[str, ...] | None, complete: bool) -> Waypoint:
         """Waypoint from a read-only array without infinite values; as `from_array`, without checks."""
         self = cls.__new__(cls)
         values = {"time": time, "jet": jet, "labels": labels, "complete": complete, "naxes": jet.shape[1]}
@@ -315,7 +315,7 @@ class Entries:
         cells = zip(self.times.tolist(), jets, np.ravel(finite.all(axis=(1, 2))).tolist(), strict=True)
         if np.isinf(self.table).any():
             return tuple(Waypoint.from_array(time, jet, self.labels) for time, jet, _ in cells)
-        return tuple(Waypoint.of_checked(time, jet, self.labels, whole) for time, jet, whole in cells)
+        return tuple(Waypoint._of_checked(time, jet, self.labels, whole) for time, jet, whole in cells)
 
 
 def waypoint_table(waypoints: Sequence[Waypoint], labels: Sequence[str]) -> Table:
