@@ -123,7 +123,8 @@ def test_loops_are_built_once_a_plan(counted, executor):
 
     run(build, cp.draws(6, tau=(0.5, 1.5)), executor and executor())
     assert built == ["step", "ramp"]
-    assert counted == {"traced": 4, "compiled": 4, "prepared": 2}
+    # Nominal runs of equal loops share a form; the draws of each plan have one.
+    assert counted == {"traced": 3, "compiled": 3, "prepared": 2}
 
 
 @pytest.mark.slow
