@@ -252,7 +252,8 @@ def _within(times: Array, rows: Array, degree: int, limits: Array) -> BSpline:
             return spline
         if not np.isfinite(excess).all():
             break
-        chosen = _divided(chosen, np.maximum.reduceat(excess[:-1], chosen[:-1]), degree)
+        worst = np.maximum.reduceat(excess, chosen[:-1])  # the last sample belongs to the last interval
+        chosen = _divided(chosen, worst, degree)
     return _interpolating(times, rows.T, degree)
 
 
