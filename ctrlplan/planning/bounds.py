@@ -104,6 +104,12 @@ class Limits:
         if self.along is not None or callable(self.low) or callable(self.high):
             self._set_over_time()
         elif bounded or (self.rate is None and self.rms is None):
+            for name, side in (("low", self.low), ("high", self.high)):
+                if is_listed(side):
+                    raise ValueError(
+                        f"{name} must be one number unless times are given by along=, got {side!r:.80}; for several "
+                        "axes give Limits by name, such as x_d1 and z_d1"
+                    )
             low, high, _ = checked_limits(_sides(self.low, self.high), "Limits")
             self._set(low=None if math.isinf(low) else low, high=None if math.isinf(high) else high)
 

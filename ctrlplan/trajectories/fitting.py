@@ -145,9 +145,9 @@ def _values(knots: Array, table: Array, times: Array) -> Array:
 def _warn_of_swing(plan: PiecewisePolynomial, rows: Array) -> None:
     """Warn at the line of the caller's caller if a plan swings far beyond its samples (naxes, nsamples)."""
     low, high = rows.min(axis=1), rows.max(axis=1)
-    allowed = MAXIMUM_SWING * (high - low) + 1e-9 * np.abs(rows).max(axis=1)  # rounding of constant samples
     powers = np.arange(len(plan.coefficients))
     with np.errstate(over="ignore", invalid="ignore"):
+        allowed = MAXIMUM_SWING * (high - low) + 1e-9 * np.abs(rows).max(axis=1)  # rounding of constant samples
         relative = plan.coefficients[::-1] * (np.diff(plan.breakpoints) ** powers[:, None])[:, :, None]
         bounds = np.tensordot(bernstein_of_powers(int(powers[-1])), relative, 1)
         if (bounds.max(axis=0).max(axis=0) - bounds.min(axis=0).min(axis=0) <= allowed).all():
@@ -201,6 +201,8 @@ def _checked_samples(times: ArrayLike, values: ArrayLike, degree: int) -> tuple[
         raise ValueError(
             f"times must be {degree + 1} or more for a spline of degree {degree}, got {moments.size}; lower continuity"
         )
+    if not float(moments[-1]) - float(moments[0]) < np.inf:
+        raise ValueError(f"times must span a finite duration, got {moments[0]:g} s to {moments[-1]:g} s")
     return moments, rows
 
 
@@ -252,7 +254,8 @@ def _within(times: Array, rows: Array, degree: int, limits: Array) -> BSpline:
             return spline
         if not np.isfinite(excess).all():
             break
-        chosen = _divided(chosen, np.maximum.reduceat(excess[:-1], chosen[:-1]), degree)
+        worst = np.maximum.reduceat(excess, chosen[:-1])  # the last sample belongs to the last interval
+        chosen = _divided(chosen, worst, degree)
     return _interpolating(times, rows.T, degree)
 
 

@@ -77,8 +77,11 @@ class Frame:
         for members in together.values():
             tables = [own for _, own, _ in members]
             whole = tables[0] if len(tables) == 1 else np.concatenate(tables)
-            axes = [axis for group, _, _ in members for axis in group.axes]
-            pieces.append(fitted(axes, members[0][0].forms, whole, members[0][2]))
+            axes = np.array([axis for group, _, _ in members for axis in group.axes])
+            if len(tables) > 1:  # functions of all axes are in the order of the axes
+                order = axes.argsort()
+                axes, whole = axes[order], whole[order]
+            pieces.append(fitted(axes.tolist(), members[0][0].forms, whole, members[0][2]))
         return filled, tuple(pieces)
 
     @cached_property

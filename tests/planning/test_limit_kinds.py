@@ -53,6 +53,8 @@ def only(found):
         (lambda: Limits(1.0, 2.0, during=(1.0, 1.0)), "during must increase"),
         (lambda: Limits(1.0, 2.0, during=(0.0, math.inf)), "during must be two finite times"),
         (lambda: Limits(1.0, 2.0, during=3.0), "during must be two numbers"),
+        (lambda: Limits(high=[1.0, 2.0]), "high must be one number unless times are given by along="),
+        (lambda: Limits(np.array([-1.0]), 1.0), "low must be one number unless times are given by along="),
         (lambda: Limits(high=[1.0, 2.0], along=[0.0]), "along must be two or more finite times"),
         (lambda: Limits(high=[1.0, 2.0], along=[1.0, 0.0]), "along must be two or more finite times that increase"),
         (lambda: Limits(high=[1.0, 2.0, 3.0], along=[0.0, 1.0]), "high must be a finite number, or 2 of them"),

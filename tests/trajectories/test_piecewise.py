@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from repetitions import examples
-from scipy.interpolate import BPoly, CubicSpline, make_interp_spline
+from scipy.interpolate import BPoly, CubicHermiteSpline, CubicSpline, make_interp_spline
 from trajectory_oracle import Direct, miss, waypoints
 
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, TrigSpline, Waypoint
@@ -134,6 +134,29 @@ def test_every_axis_has_its_own_free_entries():
     # A line's velocity is prescribed nowhere, so it may jump; the value at the join is the right-hand one.
     assert plan(1.0, 1)[2] == pytest.approx(-1.0, rel=1e-14)
     assert plan.jet(1.0, 1, left=True)[1, 2] == pytest.approx(1.0, rel=1e-14)
+
+
+def test_axes_with_the_same_free_entries_need_not_be_neighbours():
+    # Axes 0 and 2 are clamped cubic splines, the others are cubic Hermite splines: all have segments of one kind.
+    times = np.array([0.0, 0.7, 1.0, 2.5, 3.0, 4.0])
+    rng = np.random.default_rng(19)
+    values, slopes = rng.normal(size=(2, 4, times.size))
+    slopes[np.ix_([0, 2], range(1, times.size - 1))] = np.nan
+    exact = []
+    for row, slope in zip(values, slopes, strict=True):
+        ends = ((1, slope[0]), (1, slope[-1]))
+        free = np.isnan(slope).any()
+        exact.append(CubicSpline(times, row, bc_type=ends) if free else CubicHermiteSpline(times, row, slope))
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives={1: slopes}, warn=False)
+    again = PiecewiseSpline.from_arrays(times, 2.0 * values, derivatives={1: 3.0 * slopes}, warn=False)
+    for own in (plan, again.with_values(values, derivatives={1: slopes})):
+        for count in (11, 1000):  # by jets, by interpolants
+            t = np.linspace(0.0, 4.0, count)[:-1]
+            expected = np.array([[spline(t, nu) for spline in exact] for nu in range(4)])
+            np.testing.assert_allclose(own.jet(t, 3), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+            found = [segment(0.5 * (segment.start + segment.end)) for segment in own.segments]
+            middles = 0.5 * (times[1:] + times[:-1])
+            np.testing.assert_allclose(found, np.transpose([spline(middles) for spline in exact]), rtol=0, atol=1e-12)
 
 
 def test_ends_that_prescribe_less_lower_the_degree_of_their_segments():
