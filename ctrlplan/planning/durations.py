@@ -91,8 +91,8 @@ class PlansByDuration:
         margins = self.margins(duration)
         return math.inf if margins is None else -margins.active.fraction
 
-    def excess_at(self, bound: int, fraction: float) -> Callable[[float], float] | None:
-        """Excess over one limit at one relative time, from both sides, as a function of the duration.
+    def excesses_at(self, bound: int, fraction: float) -> Callable[[Array], Array] | None:
+        """Excess over one limit at one relative time, from both sides, as a function of durations (ndurations,).
 
         None if the plan does not depend on the duration by powers.
         """
@@ -104,7 +104,7 @@ class PlansByDuration:
             seen = self.limited.seen(part.plan)
             jet = np.stack([seen.jet(t, self.limited.order, left) for left in (False, True)], axis=-1)
             samples.append(Sampled(jet, np.full(2, fraction), np.full(2, 0.5), part.plan.duration))
-        return lambda duration: float(self._excesses(samples, np.array([duration]), [bound])[0])
+        return lambda durations: self._excesses(samples, durations, [bound])
 
     @cached_property
     def _parts(self) -> Sequence[Part]:

@@ -43,11 +43,13 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     """
     before = plan.jet(plan.breakpoints, order, left=True)
     after = plan.jet(plan.breakpoints, order)
+    size = after - before
+    size[:, :, -1] = -before[:, :, -1]
+    size[0, :, -1] = plan.final - before[0, :, -1]
+    if not size.any():
+        return ()
     inside = plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * _INSIDE
     samples = np.concatenate([before[:, :, 1:], after, plan.jet(inside.ravel(), order)], axis=-1)
-    after[:, :, -1] = 0.0
-    after[0, :, -1] = plan.final
-    size = after - before
     slack = [_slack(k, rows.min(axis=-1), rows.max(axis=-1)) for k, rows in enumerate(samples)]
     # Extrema of samples are nearer to 0 than those of the plan, which are computed for orders that may jump alone.
     for k in np.flatnonzero((np.abs(size) > np.array(slack)[:, :, None]).any(axis=(1, 2))).tolist():
