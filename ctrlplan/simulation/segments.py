@@ -219,9 +219,7 @@ def integrate(
         course.prolong(apart([first, *marks, last])[1:-1], first, last)
     memory, schedule, rounding = course.memory, course.schedule, course.rounding
     shortest, reach, longest = _lengths(network, memory.delays, last - first, stops_after is not None)
-    known: list[tuple[float, Array, Array, Array]] = []  # of each segment: start, state, times inside, states there
-    segments, span = list[tuple[float, Series]](), list[Series]()
-    left = first
+    found, span, left = _Recorded(), list[Series](), first
     x = schedule.sample(equations, first, state)
     while left < last:
         check(left)  # CVODES is not interrupted within a segment, which has a maximum number of steps
@@ -239,35 +237,51 @@ def integrate(
         inside = times[times.searchsorted(left) : times.searchsorted(right)]
         grid, requested = memory.grid(left, right, inside[1:] if inside.size and inside[0] <= left else inside)
         try:
-            found = _advanced(solver, series, left, grid, x, last)
+            states = _advanced(solver, series, left, grid, x, last)
         except SolverError:
             if right - left < shortest:
                 raise
             reach = 0.5 * (right - left)
             continue
-        if not memory.record(left, right, series, grid, found):
+        if not memory.record(left, right, series, grid, states):
             reach = 0.5 * (right - left)
             continue
         schedule.add(memory.jumps)
-        segments.append((left, series))
-        known.append((left, x, grid[requested], found[:, requested]))
-        before, x = x, found[:, -1]
+        found.add(series, left, x, grid[requested], states[:, requested])
+        before, x = x, states[:, -1]
         if ends or right < last:
             x = schedule.sample(equations, right, x)
         if stops_after is not None:
-            grid, found = np.append(left, grid), np.column_stack([before, found])
-            stop = stops_after(grid, found)
-            if stop is not None:  # what follows is not part of the run
-                begin, start, inside, states = known.pop()
-                before_stop = inside < grid[stop]
-                known.append((begin, start, inside[before_stop], states[:, before_stop]))
-                left, x = float(grid[stop]), found[:, stop] if stop < grid.size - 1 else x
-                break
+            grid, states = np.append(left, grid), np.column_stack([before, states])
+            stop = stops_after(grid, states)
+            if stop is not None:
+                return found.run(float(grid[stop]), states[:, stop] if stop < grid.size - 1 else x)
         left, reach = right, min(longest, 2.0 * reach)
-    known.append((left, x, times[:0], np.empty((x.size, 0))))
-    t = np.concatenate([part for left, _, inside, _ in known for part in ((left,), inside)])
-    states = np.concatenate([part for _, start, _, found in known for part in (start[:, None], found)], axis=1)
-    return NetworkRun(t, states, segments)
+    return found.run(left, x)
+
+
+class _Recorded:
+    """Segments of a run: their series, their start with the state there, and output times inside with the states."""
+
+    def __init__(self) -> None:
+        self._segments: list[tuple[float, Series]] = []
+        self._times: list[Array] = []
+        self._states: list[Array] = []
+
+    def add(self, series: Series, left: float, state: Array, inside: Array, states: Array) -> None:
+        """Add a segment."""
+        self._segments.append((left, series))
+        self._times += [np.array([left]), inside]
+        self._states += [state[:, None], states]
+
+    def run(self, end: float, state: Array) -> NetworkRun:
+        """The run until an end in the last segment, with the state there."""
+        if self._segments:
+            before = self._times[-1] < end
+            self._times[-1], self._states[-1] = self._times[-1][before], self._states[-1][:, before]
+        t = np.concatenate([*self._times, np.array([end])])
+        x = np.concatenate([*self._states, state[:, None]], axis=1)
+        return NetworkRun(t, x, self._segments)
 
 
 class Course:

@@ -95,7 +95,7 @@ def test_the_search_goes_on_while_the_violation_falls():
 
 def test_the_search_ends_where_the_violation_does_not_fall():
     move = cp.PolySpline([cp.Waypoint(0, 0, 1.0, 0), cp.Waypoint(1, 20, 0, 0)])
-    with pytest.raises(ValueError, match=r"y_d1 within ±0.2: 1 at 0 s, 400 % beyond"):
+    with pytest.raises(ValueError, match=r"got y_d1 = 1 of the waypoint at 0 s, where it must be within ±0.2"):
         cp.fastest(move, {"velocity": 0.2}, hold="waypoints")
     still = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 20, 0, 0)])
     with pytest.raises(ValueError, match="for a wider search pass durations"):

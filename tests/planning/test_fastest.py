@@ -412,9 +412,20 @@ def test_a_closed_plan_stays_closed(name, hold):
     assert jet[2] <= 3.0 * (1 + 1e-11)
 
 
-def test_a_time_law_with_a_limited_fifth_derivative_would_open_a_closed_plan():
+@pytest.mark.slow
+def test_a_closed_plan_stays_closed_with_a_limited_fifth_derivative():
+    found = fastest(CYCLE, {"velocity": 2.0, "y1_d5": 3e4}, hold="path").plan
+    first, last = found.jet(found.start, 4), found.jet(found.end, 4, left=True)
+    jet = found.jet(np.linspace(found.start, found.end, COUNT), 5)
+    sizes = np.abs(jet[:5]).max(axis=2)
+    assert (np.abs(first - last) <= 1e-8 * sizes).all()
+    assert np.abs(jet[1]).max() <= 2.0 * (1 + 1e-11)
+    assert np.abs(jet[5, 0]).max() <= 3e4 * (1 + 1e-9)
+
+
+def test_a_time_law_with_a_limited_sixth_derivative_would_open_a_closed_plan():
     with pytest.raises(ValueError, match="hold must be 'shape' or 'waypoints' for a closed plan, got 'path'"):
-        fastest(CYCLE, {"velocity": 2.0, "y1_d5": 3e4}, hold="path")
+        fastest(CYCLE, {"velocity": 2.0, "y1_d6": 3e6}, hold="path")
 
 
 @pytest.mark.slow

@@ -123,8 +123,8 @@ def test_what_is_admissible_passes_unchanged(plan):
     times = 0.05 * np.arange(161)
     found = cp.simulate(lag_loop(), times, {"r_cmd": plan})
     assert np.array_equal(found.states[1], np.ones(161))
-    # A plan is known to a rounding error; the reference is closer than that to the command.
-    assert np.abs(found.outputs[2] - plan(times)).max() <= np.spacing(1.0)
+    # Two evaluations of a plan differ by the rounding of its six terms, each at most 15 times the move.
+    assert np.abs(found.outputs[2] - plan(times)).max() <= 6 * 15 * 0.6 * 0.5 * np.spacing(1.0)
     assert found.events == []
 
 

@@ -202,7 +202,7 @@ def test_the_old_names_warn_and_do_the_same():
 @pytest.mark.parametrize(
     ("wrong", "got"),
     [
-        (cp.plants.Crane, "Crane"),
+        (cp.plants.Crane, "the class Crane"),
         ({"u": 1}, "dict"),
     ],
 )
