@@ -55,8 +55,17 @@ _STEPS = 5
 _NEAR = 1e-8
 """Change of a duration, relative to it, whose square is below rounding."""
 
+_INWARDS = 4.0 * float(np.finfo(float).eps)
+"""Distance from a boundary of the feasible durations, relative to it, within which a signal may exceed by rounding."""
+
 _WIDTHS = 1e-7 * 8.0 ** np.arange(6.0)
 """Changes of a duration within which its excess at one time is searched for a root, relative to it."""
+
+_NARROWINGS = 60
+"""Maximum number of parts of an interval with a change of sign, each at most half of the one before."""
+
+_ABOUT = np.array([-0.1, -1e-3, -1e-5, -1e-7, -1e-9, 0.0, 1e-9, 1e-7, 1e-5, 1e-3, 0.1])
+"""Points about the root of a chord, relative to its length."""
 
 _RESOLVED = 1e-10
 """Increase of a duration by which limits that are violated by rounding are satisfied, relative to it."""
@@ -952,12 +961,15 @@ def _edge(family: PlansByDuration, middle: float, inside: float, outside: float)
     the duration at which that time was found.
     """
     edge = _sampled_root(family, inside, outside)
+    peak = None if edge is None else family.peak(edge)
+    if edge is not None and peak is not None:
+        edge = _root_at(family, edge, *peak) or edge
     for _ in range(_STEPS if edge is not None else 0):
         root = None if edge is None else _root_at_extremum(family, edge)
         if root is None or edge is None or not min(inside, outside) <= root <= max(inside, outside):
             break
         if abs(root - edge) <= _NEAR * edge:
-            return root
+            return root * (1.0 + math.copysign(_INWARDS, inside - outside))
         edge = root
     return _feasible_edge(family.exact_excess, family.excess, middle, outside)
 
@@ -982,7 +994,12 @@ def _root_at_extremum(family: PlansByDuration, duration: float) -> float | None:
         return None
     bounds, row = family.limited.bounds, margins.active
     chosen = [k for k, bound in enumerate(bounds) if bound == row.bound and bound.is_constant and bound.kind == "value"]
-    excesses = family.excesses_at(chosen[0], (row.time - family.given.start) / duration) if chosen else None
+    return _root_at(family, duration, chosen[0], (row.time - family.given.start) / duration) if chosen else None
+
+
+def _root_at(family: PlansByDuration, duration: float, bound: int, fraction: float) -> float | None:
+    """Duration near another at which the excess over a limit vanishes at a relative time; None if there is none."""
+    excesses = family.excesses_at(bound, fraction)
     if excesses is None:
         return None
     ends = duration * (1.0 + _WIDTHS[:, None] * np.array([-1.0, 1.0]))
@@ -991,11 +1008,24 @@ def _root_at_extremum(family: PlansByDuration, duration: float) -> float | None:
     if not crossed.size or not np.isfinite(found[crossed[0]]).all():
         return None
 
-    def excess(duration: float) -> float:
-        return float(excesses(np.array([duration]))[0])
+    k = int(crossed[0])
+    return _narrowed(excesses, ends[k], found[k])
 
-    low, high = ends[crossed[0]].tolist()
-    return float(brentq(excess, low, high, xtol=1e-15 * duration, rtol=4.0 * np.finfo(float).eps))
+
+def _narrowed(function: Callable[[Array], Array], ends: Array, values: Array) -> float:
+    """Point with a value of at most 0 at a change of sign between two ends (2,), by parts about the chord's root."""
+    for _ in range(_NARROWINGS):
+        width, middle = ends[1] - ends[0], 0.5 * (ends[0] + ends[1])
+        if width <= 4.0 * np.finfo(float).eps * ends[1]:
+            break
+        chord = values[1] - values[0]
+        root = ends[0] - values[0] * width / chord if math.isfinite(chord) else middle
+        inner = np.sort(np.append(np.clip(root + width * _ABOUT, *ends), middle))
+        points, rows = np.concatenate([ends[:1], inner, ends[1:]]), function(inner)
+        rows = np.concatenate([values[:1], rows, values[1:]])
+        k = int(np.flatnonzero((rows[1:] > 0.0) != (rows[:-1] > 0.0))[0])
+        ends, values = points[k : k + 2], rows[k : k + 2]
+    return float(ends[0] if values[0] <= 0.0 else ends[1])
 
 
 def _feasible_edge(
