@@ -17,6 +17,9 @@ from ctrlplan.trajectories.waypoint import Waypoint
 _TOGETHER = 2**15
 """Number of samples that are evaluated together."""
 
+_ABOUT_PEAK = 33
+"""Number of samples between the neighbours of the sample of the maximum excess."""
+
 
 class Part(NamedTuple):
     """Part of a plan that depends on the duration by a power.
@@ -91,8 +94,49 @@ class PlansByDuration:
         margins = self.margins(duration)
         return math.inf if margins is None else -margins.active.fraction
 
-    def excess_at(self, bound: int, fraction: float) -> Callable[[float], float] | None:
-        """Excess over one limit at one relative time, from both sides, as a function of the duration.
+    def peak(self, duration: float) -> tuple[int, float] | None:
+        """Constant limit with the maximum excess of a duration, and its relative time, by samples and those about it.
+
+        None if the plan does not depend on the duration by powers or is infeasible for the plant, or if a limit of
+        another kind has the maximum.
+        """
+        if not self._parts:
+            return None
+        fractions = self._samples[0].fractions
+        try:
+            rows = self._excesses_over_time(self._samples, duration)
+            bound, at = np.unravel_index(int(rows.argmax()), rows.shape)
+            left = fractions[fractions < fractions[at]].max(initial=0.0)
+            right = fractions[fractions > fractions[at]].min(initial=1.0)
+            near = np.linspace(left, right, _ABOUT_PEAK)
+            row = self._excesses_over_time(self._sampled_at(near), duration)[bound]
+        except ValueError:
+            return None
+        limit = self.limited.bounds[bound]
+        if not (limit.is_constant and limit.kind == "value"):
+            return None
+        k = min(max(int(row.argmax()), 1), near.size - 2)
+        below, here, above = row[k - 1 : k + 2].tolist()
+        curve = below - 2.0 * here + above
+        move = 0.5 * (below - above) / curve if curve < 0.0 else 0.0  # to the vertex of a parabola
+        return int(bound), float(near[k] + min(max(move, -1.0), 1.0) * (near[1] - near[0]))
+
+    def _sampled_at(self, fractions: Array) -> list[Sampled]:
+        """Samples of each part at relative times."""
+        found = []
+        for part in self._parts:
+            jet = self.limited.seen(part.plan).jet(part.plan.start + fractions * part.plan.duration, self.limited.order)
+            found.append(Sampled(jet, fractions, np.full(fractions.size, 1.0 / fractions.size), part.plan.duration))
+        return found
+
+    def _excesses_over_time(self, samples: list[Sampled], duration: float) -> Array:
+        """Excess (nbounds, ntime) over each limit at samples of a feasible duration."""
+        values = self.limited.values(self._jets(samples, np.array([duration]))[:, :, 0])
+        rows = [bound.excess(row) for bound, row in zip(self.limited.bounds, values, strict=True)]
+        return np.nan_to_num(np.array(rows), nan=-math.inf)
+
+    def excesses_at(self, bound: int, fraction: float) -> Callable[[Array], Array] | None:
+        """Excess over one limit at one relative time, from both sides, as a function of durations (ndurations,).
 
         None if the plan does not depend on the duration by powers.
         """
@@ -104,7 +148,7 @@ class PlansByDuration:
             seen = self.limited.seen(part.plan)
             jet = np.stack([seen.jet(t, self.limited.order, left) for left in (False, True)], axis=-1)
             samples.append(Sampled(jet, np.full(2, fraction), np.full(2, 0.5), part.plan.duration))
-        return lambda duration: float(self._excesses(samples, np.array([duration]), [bound])[0])
+        return lambda durations: self._excesses(samples, durations, [bound])
 
     @cached_property
     def _parts(self) -> Sequence[Part]:
@@ -117,12 +161,16 @@ class PlansByDuration:
 
     def _excesses(self, samples: list[Sampled], durations: Array, bounds: Sequence[int] | None = None) -> Array:
         """Maximum excess (ndurations,) from samples of each part."""
+        return self.limited.excesses_of(self._jets(samples, durations), samples[0], durations, bounds)
+
+    def _jets(self, samples: list[Sampled], durations: Array) -> Array:
+        """Jets (order + 1, naxes, ndurations, ntime) from samples of each part."""
         orders = np.arange(self.limited.order + 1)[:, None]
         jets: Array = np.zeros(())
         for part, own in zip(self._parts, samples, strict=True):
             powers = (durations / own.duration) ** (part.order - orders)
             jets = jets + own.jet[:, :, None] * powers[:, None, :, None]
-        return self.limited.excesses_of(jets, samples[0], durations, bounds)
+        return jets
 
 
 class ReplannedPlans(PlansByDuration):

@@ -43,6 +43,9 @@ _DOUBLINGS_IN_LOOP = 6
 _EDGE = 1e-7
 """Resolution of a minimum duration by simulated responses, relative to the duration."""
 
+_ROUNDING = 1e-14
+"""The same by exact responses."""
+
 _FALLS = 0.99
 """Ratio of the violations of durations that differ by an octave below which a longer one may be feasible."""
 
@@ -52,8 +55,17 @@ _STEPS = 5
 _NEAR = 1e-8
 """Change of a duration, relative to it, whose square is below rounding."""
 
-_ROUNDING = 1e-14
-"""The same by exact responses."""
+_INWARDS = 4.0 * float(np.finfo(float).eps)
+"""Distance from a boundary of the feasible durations, relative to it, within which a signal may exceed by rounding."""
+
+_WIDTHS = 1e-7 * 8.0 ** np.arange(6.0)
+"""Changes of a duration within which its excess at one time is searched for a root, relative to it."""
+
+_NARROWINGS = 60
+"""Maximum number of parts of an interval with a change of sign, each at most half of the one before."""
+
+_ABOUT = np.array([-0.1, -1e-3, -1e-5, -1e-7, -1e-9, 0.0, 1e-9, 1e-7, 1e-5, 1e-3, 0.1])
+"""Points about the root of a chord, relative to its length."""
 
 _RESOLVED = 1e-10
 """Increase of a duration by which limits that are violated by rounding are satisfied, relative to it."""
@@ -67,7 +79,7 @@ _RESERVES = (1e-4, 3e-4, 1e-3, 3e-3)
 _AT_ENDS = 1e-12
 """Excess that is the rounding of a given speed at a limit."""
 
-_STEPS, _NEAR = 6, 1e-9
+_EVALUATIONS, _ACTIVE = 6, 1e-9
 """Number of evaluations of a plan near its limits, and margin of the active limit that ends them."""
 
 _LOCAL = "not searched; a local minimum of the time law"
@@ -524,7 +536,9 @@ def _scaled_by_orders(
 
 
 def _moves(plan: Trajectory) -> bool:
-    """Whether a position changes by more than rounding: at breakpoints, otherwise over the whole plan."""
+    """Whether a position changes by more than rounding: from start to end, otherwise over the whole plan."""
+    if (np.abs(plan.final - plan.initial) > 1e-12 * np.maximum(np.abs(plan.initial), np.abs(plan.final))).any():
+        return True
     positions = np.concatenate([plan(plan.breakpoints), plan(0.5 * (plan.breakpoints[1:] + plan.breakpoints[:-1]))], -1)
     if (np.ptp(positions, axis=-1) > 1e-12 * np.abs(positions).max(axis=-1)).any():
         return True
@@ -697,10 +711,10 @@ def _at_its_limit(plan: Trajectory, limited: Limited) -> Fastest | None:
 
     The duration is that at which the signal at the time of its extremum attains the limit.
     """
-    for _ in range(_STEPS):
+    for _ in range(_EVALUATIONS):
         margins = limited.margins(plan)
         active = margins.active
-        if 0.0 <= active.fraction <= _NEAR:
+        if 0.0 <= active.fraction <= _ACTIVE:
             return Fastest(plan, margins, ((plan.duration, plan.duration),), "path", limited, statement=_LOCAL)
         row = next(k for k, bound in enumerate(limited.bounds) if active.of(bound))
         jet = np.stack([plan.jet(active.time, limited.order, left=left) for left in (True, False)], axis=-1)
@@ -713,7 +727,7 @@ def _at_its_limit(plan: Trajectory, limited: Limited) -> Fastest | None:
             factor = float(brentq(excess, 0.97, 1.1, xtol=1e-15))
         except ValueError:  # the signal has no such duration nearby, or is infeasible for the plant
             return None
-        plan = plan.retime(plan.duration * factor * (1.0 + 0.1 * _NEAR))
+        plan = plan.retime(plan.duration * factor * (1.0 + 0.1 * _ACTIVE))
     return None
 
 
@@ -947,12 +961,15 @@ def _edge(family: PlansByDuration, middle: float, inside: float, outside: float)
     the duration at which that time was found.
     """
     edge = _sampled_root(family, inside, outside)
+    peak = None if edge is None else family.peak(edge)
+    if edge is not None and peak is not None:
+        edge = _root_at(family, edge, *peak) or edge
     for _ in range(_STEPS if edge is not None else 0):
         root = None if edge is None else _root_at_extremum(family, edge)
         if root is None or edge is None or not min(inside, outside) <= root <= max(inside, outside):
             break
         if abs(root - edge) <= _NEAR * edge:
-            return root
+            return root * (1.0 + math.copysign(_INWARDS, inside - outside))
         edge = root
     return _feasible_edge(family.exact_excess, family.excess, middle, outside)
 
@@ -977,18 +994,38 @@ def _root_at_extremum(family: PlansByDuration, duration: float) -> float | None:
         return None
     bounds, row = family.limited.bounds, margins.active
     chosen = [k for k, bound in enumerate(bounds) if bound == row.bound and bound.is_constant and bound.kind == "value"]
-    excess = family.excess_at(chosen[0], (row.time - family.given.start) / duration) if chosen else None
-    if excess is None:
+    return _root_at(family, duration, chosen[0], (row.time - family.given.start) / duration) if chosen else None
+
+
+def _root_at(family: PlansByDuration, duration: float, bound: int, fraction: float) -> float | None:
+    """Duration near another at which the excess over a limit vanishes at a relative time; None if there is none."""
+    excesses = family.excesses_at(bound, fraction)
+    if excesses is None:
         return None
-    width = 1e-7
-    while width < 1e-2:
-        low, high = duration * (1.0 - width), duration * (1.0 + width)
-        if (excess(low) > 0.0) != (excess(high) > 0.0):
-            if not (math.isfinite(excess(low)) and math.isfinite(excess(high))):
-                return None
-            return float(brentq(excess, low, high, xtol=1e-15 * duration, rtol=4.0 * np.finfo(float).eps))
-        width *= 8.0
-    return None
+    ends = duration * (1.0 + _WIDTHS[:, None] * np.array([-1.0, 1.0]))
+    found = excesses(ends.ravel()).reshape(ends.shape)
+    crossed = np.flatnonzero((found[:, 0] > 0.0) != (found[:, 1] > 0.0))
+    if not crossed.size or not np.isfinite(found[crossed[0]]).all():
+        return None
+
+    k = int(crossed[0])
+    return _narrowed(excesses, ends[k], found[k])
+
+
+def _narrowed(function: Callable[[Array], Array], ends: Array, values: Array) -> float:
+    """Point with a value of at most 0 at a change of sign between two ends (2,), by parts about the chord's root."""
+    for _ in range(_NARROWINGS):
+        width, middle = ends[1] - ends[0], 0.5 * (ends[0] + ends[1])
+        if width <= 4.0 * np.finfo(float).eps * ends[1]:
+            break
+        chord = values[1] - values[0]
+        root = ends[0] - values[0] * width / chord if math.isfinite(chord) else middle
+        inner = np.sort(np.append(np.clip(root + width * _ABOUT, *ends), middle))
+        points, rows = np.concatenate([ends[:1], inner, ends[1:]]), function(inner)
+        rows = np.concatenate([values[:1], rows, values[1:]])
+        k = int(np.flatnonzero((rows[1:] > 0.0) != (rows[:-1] > 0.0))[0])
+        ends, values = points[k : k + 2], rows[k : k + 2]
+    return float(ends[0] if values[0] <= 0.0 else ends[1])
 
 
 def _feasible_edge(

@@ -756,10 +756,10 @@ class Limited:
         there is not 0: then it is the continuation of a motion.
         """
         plan = self.seen(plan)
-        moving = {t for t in (plan.start, plan.end) if plan.jet(t, 1, left=t > plan.start)[1].any()}
         highest = max((self.bounds[k].order for k in self._local), default=0)
         jumps = plan.jumps(highest - 1) if highest else ()
-        for k in self._local:
+        moving = {t for t in (plan.start, plan.end) if jumps and plan.jet(t, 1, left=t > plan.start)[1].any()}
+        for k in self._local if jumps else ():
             bound = self.bounds[k]
             axes = {plan.labels[signal.axis] for signal, _ in bound.terms if signal.axis is not None}
             first, last = (-math.inf, math.inf) if bound.interval is None else self._interval(bound, plan)

@@ -43,17 +43,19 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     """
     before = plan.jet(plan.breakpoints, order, left=True)
     after = plan.jet(plan.breakpoints, order)
-    inside = plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * _INSIDE
-    samples = np.concatenate([before[:, :, 1:], after, plan.jet(inside.ravel(), order)], axis=-1)
-    after[:, :, -1] = 0.0
-    after[0, :, -1] = plan.final
     size = after - before
-    slack = [_slack(k, rows.min(axis=-1), rows.max(axis=-1)) for k, rows in enumerate(samples)]
+    size[:, :, -1] = -before[:, :, -1]
+    size[0, :, -1] = plan.final - before[0, :, -1]
+    samples = np.concatenate([before[:, :, 1:], after], axis=-1)
+    if not (np.abs(size) > _slacks(samples)[:, :, None]).any():  # further samples could only add to what is rounding
+        return ()
+    inside = plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * _INSIDE
+    slack = _slacks(np.concatenate([samples, plan.jet(inside.ravel(), order)], axis=-1))
     # Extrema of samples are nearer to 0 than those of the plan, which are computed for orders that may jump alone.
-    for k in np.flatnonzero((np.abs(size) > np.array(slack)[:, :, None]).any(axis=(1, 2))).tolist():
+    for k in np.flatnonzero((np.abs(size) > slack[:, :, None]).any(axis=(1, 2))).tolist():
         exact = plan.extrema(k)
         slack[k] = _slack(k, exact.minimum, exact.maximum)
-    jumps = np.abs(size) > np.array(slack)[:, :, None]
+    jumps = np.abs(size) > slack[:, :, None]
     if jumps.any():
         jumps &= np.abs(size) > _by_rounding_of_times(plan, order)
     found = np.argwhere(jumps)
@@ -71,6 +73,11 @@ def _by_rounding_of_times(plan: Trajectory, order: int) -> Array:
     """Differences (order + 1, naxes, nbreakpoints) between both sides if breakpoints are rounded."""
     sides = [plan.jet(plan.breakpoints, order + 1, left=left)[1:] for left in (True, False)]
     return 4.0 * np.spacing(np.abs(plan.breakpoints)) * np.abs(sides).max(axis=0)
+
+
+def _slacks(samples: Array) -> Array:
+    """Sizes of differences that are rounding (order + 1, naxes), for samples of the derivatives."""
+    return np.stack([_slack(k, rows.min(axis=-1), rows.max(axis=-1)) for k, rows in enumerate(samples)])
 
 
 def _slack(order: int, minimum: Array, maximum: Array) -> Array:

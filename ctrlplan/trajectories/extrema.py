@@ -32,6 +32,7 @@ _DEEPEST = 50  # number of halvings of a segment to the resolution of floating-p
 _FIT = 32  # degree of an interpolant
 _CHECKS = 8  # minimum number of check points of a piece, none of them a node of its interpolant
 _ROUNDING = 8.0 * float(np.finfo(float).eps)
+_PROPORTIONAL = 1e-13  # difference of intervals of two plans of the same shape, relative to them
 _TINY = float(np.finfo(float).tiny)
 
 
@@ -86,10 +87,16 @@ class _Known:
     places : dict
         Candidates for extrema by order and segment, relative to the duration of the
         segment.
+    exact : set
+        Orders and segments whose candidates need no Newton step.
+    together : dict
+        Segments and candidates in them by order, of all segments, relative as well.
     """
 
     extrema: dict[int, Extrema] = field(default_factory=dict)
     places: dict[tuple[int, int], Array] = field(default_factory=dict)
+    exact: set[tuple[int, int]] = field(default_factory=set)
+    together: dict[int, Places] = field(default_factory=dict)
 
 
 _KNOWN: dict[int, _Known] = {}
@@ -104,9 +111,26 @@ def _known(plan: Trajectory) -> _Known:
     return _KNOWN.setdefault(key, _Known())
 
 
-def keep_places(plan: Trajectory, moved: Trajectory) -> None:
-    """Keep the places of extrema of a plan for the same path at other times, where values are computed again."""
-    _known(moved).places.update(_known(plan).places)
+def keep_places(plan: Trajectory, moved: Trajectory, times: Array, moved_times: Array) -> None:
+    """Keep the places of extrema of a plan for the same path at other times, where values are computed again.
+
+    Parameters
+    ----------
+    plan, moved : Trajectory
+        The plan, and the same at other times.
+    times, moved_times : ndarray, shape (ntimes,)
+        Times [s] that determine the shape of either: waypoints or breakpoints. With
+        equal proportions the places are the same up to rounding.
+    """
+    known, own = _known(plan), _known(moved)
+    own.places.update(known.places)
+    if times.size < 2:
+        return
+    lengths, moved_lengths = np.diff(times), np.diff(moved_times)
+    rate = (moved_times[-1] - moved_times[0]) / (times[-1] - times[0])
+    if (np.abs(moved_lengths - rate * lengths) <= _PROPORTIONAL * moved_lengths).all():
+        own.exact.update(known.places)
+        own.together.update(known.together)
 
 
 def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
@@ -140,13 +164,25 @@ def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     if nu == 0 or plan.breakpoints.size == 1:
         held = np.zeros((2, plan.naxes)) if nu else np.stack([plan.initial, plan.final])
         found.add(np.array([plan.start, plan.end]), held.T, (plan.start, plan.end))
-    places = None if plan.in_batches else plan.stationary_places(nu)
+    places = None if plan.in_batches else _stationary_places(plan, nu)
     if plan.in_batches or places is not None:
         _search_together(plan, nu, places, found)
     else:
         for segment in range(plan.breakpoints.size - 1):
             _search(plan, nu, segment, found)
     return found.extrema()
+
+
+def _stationary_places(plan: Trajectory, nu: int) -> Places | None:
+    """Stationary points of all segments, as `Trajectory.stationary_places`, or kept ones."""
+    known, durations = _known(plan).together, np.diff(plan.breakpoints)
+    if nu in known:
+        segments, shares = known[nu]
+        return segments, shares * durations[segments]
+    places = plan.stationary_places(nu)
+    if places is not None:
+        known[nu] = (places[0], places[1] / durations[places[0]])
+    return places
 
 
 def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None:
@@ -156,12 +192,15 @@ def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None
         return plan.segment_jet(segment, t, order)
 
     duration = float(plan.breakpoints[segment + 1] - plan.breakpoints[segment])
-    places = _known(plan).places
-    if (nu, segment) in places:
-        t = _with_polished(jet, places[nu, segment] * duration, nu, duration)
+    known, key = _known(plan), (nu, segment)
+    places = known.places
+    if key in known.exact:
+        t = places[key] * duration
+    elif key in places:
+        t = _with_polished(jet, places[key] * duration, nu, duration)
     else:
         t = stationary_times(jet, duration, nu)
-        places[nu, segment] = t / duration
+        places[key] = t / duration
     times, ends = _placed(plan, segment, t)
     found.add(times, jet(t, nu)[nu], ends)
 
@@ -171,19 +210,26 @@ def _search_together(plan: Trajectory, nu: int, places: Places | None, found: _C
     breakpoints, durations = plan.breakpoints, np.diff(plan.breakpoints)
     every, lengths = np.tile(np.arange(durations.size), 2), np.append(np.zeros(durations.size), durations)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        values = plan.segments_jet(every, lengths, nu)[nu]
-        found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), values)
-        segments, s = places or inner_extrema(plan, nu, values.min(axis=1), values.max(axis=1))
-        if not s.size:
-            return
-        slope, curve = plan.segments_jet(segments, s, nu + 2)[nu + 1 :]
-        moved = s - slope / curve  # as `_polished`
-    duration = durations[segments]
-    near = np.isfinite(moved) & (np.abs(moved - s) < 1e-6 * duration) & (moved >= 0.0) & (moved <= duration)
-    segments = np.concatenate([segments, *(segments[row] for row in near)])
-    s = np.concatenate([s, moved[near]])
+        if places is None:  # those of interpolants, whose places depend on the values at the ends
+            values = plan.segments_jet(every, lengths, nu)[nu]
+            found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), values)
+            places = inner_extrema(plan, nu, values.min(axis=1), values.max(axis=1))
+            every, lengths = every[:0], lengths[:0]
+            if not places[1].size:
+                return
+        segments, s = places
+        if s.size:
+            slope, curve = plan.segments_jet(segments, s, nu + 2)[nu + 1 :]
+            moved = s - slope / curve  # as `_polished`
+            duration = durations[segments]
+            near = np.isfinite(moved) & (np.abs(moved - s) < 1e-6 * duration) & (moved >= 0.0) & (moved <= duration)
+            segments = np.concatenate([segments, *(segments[row] for row in near)])
+            s = np.concatenate([s, moved[near]])
+        values = plan.segments_jet(np.append(every, segments), np.append(lengths, s), nu)[nu]
+    if every.size:
+        found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), values[:, : every.size])
     starts, ends = breakpoints[segments], breakpoints[segments + 1]
-    found.add(np.clip(starts + s, starts, np.nextafter(ends, starts)), plan.segments_jet(segments, s, nu)[nu])
+    found.add(np.clip(starts + s, starts, np.nextafter(ends, starts)), values[:, every.size :])
 
 
 def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: int) -> Array:

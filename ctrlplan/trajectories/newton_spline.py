@@ -221,7 +221,7 @@ class NewtonSpline(WaypointSpline):
         if options.period is not None:
             options = options._replace(period=options.period / rate)
         plan = self._again(moved, options)
-        keep_places(self, plan)
+        keep_places(self, plan, np.array(self._times), np.array(plan._times))
         return plan
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:

@@ -16,6 +16,7 @@ from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.chosen import checked_alpha, chosen_alpha
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
+from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.pieces import Pieces, Run, scales
@@ -350,7 +351,9 @@ class PiecewiseSpline(WaypointSpline):
         """Same path at other times; as `Trajectory.map_time`."""
         times = np.array([mapped_time(t, origin, target, rate) for t in self._entries.times.tolist()])
         period = None if self._period is None else self._period / rate
-        return self._again(self._entries.scaled(times, rate), self._warn, period=period)
+        plan = self._again(self._entries.scaled(times, rate), self._warn, period=period)
+        keep_places(self, plan, self.breakpoints, plan.breakpoints)
+        return plan
 
     def _marked_times(self) -> Array:
         return self.breakpoints

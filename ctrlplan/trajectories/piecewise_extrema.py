@@ -24,6 +24,7 @@ _PARTS = 4
 """Number of parts of a segment with their own bounds."""
 
 _ROUNDING = 8.0 * float(np.finfo(float).eps)
+_TIED = 1e-12  # above the change of a derivative by the rounding of times
 _TINY = float(np.finfo(float).tiny)
 
 
@@ -115,8 +116,8 @@ def stationary_places(groups: Iterable[Sequence[Polynomials]], durations: Array,
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
             return None
         size = np.maximum(np.abs(minimum), np.abs(maximum)).max(axis=1, keepdims=True)
-        slack = 2.0 * _ROUNDING * np.maximum(size, _TINY)
-        # Ties with other segments as well, of which the earliest counts.
+        slack = _TIED * np.maximum(size, _TINY)
+        # Ties with other segments as well, of which the earliest counts, also of the same shape at other times.
         above = (high > maximum) & (high >= maximum.max(axis=1, keepdims=True) - slack)
         below = (low < minimum) & (low <= minimum.min(axis=1, keepdims=True) + slack)
         for run in runs:

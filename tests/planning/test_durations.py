@@ -6,6 +6,7 @@ from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan.planning.durations import PlansByDuration, ReplannedPlans, replanned
+from ctrlplan.planning.fastest import _narrowed
 from ctrlplan.planning.limits import Limited
 
 RNG = np.random.default_rng(0)
@@ -100,3 +101,39 @@ def test_the_search_ends_where_the_violation_does_not_fall():
     still = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 20, 0, 0)])
     with pytest.raises(ValueError, match="for a wider search pass durations"):
         cp.fastest(still, {"velocity": 0.2}, hold="waypoints", durations=(1.0, 64.0))
+
+
+@pytest.mark.parametrize(
+    ("function", "ends", "root"),
+    [
+        (lambda t: 2.0 - t**2, (1.0, 2.0), np.sqrt(2.0)),
+        (lambda t: t**3 - 5.0, (1.0, 2.0), 5.0 ** (1.0 / 3.0)),
+        (lambda t: np.where(t < 1.3, 1.0, -1e-9), (1.0, 2.0), 1.3),  # a jump
+        (lambda t: np.where(t < 1.7, np.inf, 1.8 - t), (1.0, 2.0), 1.8),
+        (lambda t: np.where(t < 1.7, 1.8 - t, -np.inf), (1.0, 2.0), 1.7),
+        (lambda t: np.cbrt(1.1 - t), (1.0, 2.0), 1.1),  # an infinite slope
+        (lambda t: (1.25 - t) ** 9, (1.0, 2.0), 1.25),
+    ],
+)
+def test_a_change_of_sign_is_narrowed_to_rounding(function, ends, root):
+    found = _narrowed(function, np.array(ends), function(np.array(ends)))
+    assert function(np.array([found]))[0] <= 0.0
+    # Where the function is 0 by rounding, every point is a root.
+    assert found == pytest.approx(root, rel=2e-15, abs=0.0) or function(np.array([found]))[0] == 0.0
+
+
+@pytest.mark.parametrize("hold", ["shape", "waypoints"])
+def test_the_peak_of_the_excess_is_that_between_samples(hold):
+    family = ReplannedPlans if hold == "waypoints" else PlansByDuration
+    move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+    found = family(move, Limited(move, {"y_d2": 3.0})).peak(2.0)
+    # The acceleration of the quintic 10 s^3 - 15 s^4 + 6 s^5 is 60 s - 180 s^2 + 120 s^3.
+    assert found is not None
+    assert found[0] == 0
+    # Both extrema, at 1/2 -+ sqrt(3)/6, have the same magnitude.
+    assert min(abs(found[1] - 0.5 + np.sqrt(3) / 6), abs(found[1] - 0.5 - np.sqrt(3) / 6)) < 1e-6
+
+
+def test_a_limit_over_an_interval_has_no_such_peak():
+    move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+    assert PlansByDuration(move, Limited(move, {"y_d1": cp.Limits(-1, 1, during=(0.2, 0.5))})).peak(2.0) is None

@@ -488,3 +488,28 @@ def test_extrema_are_computed_once_and_are_the_callers_own(monkeypatch):
     np.testing.assert_array_equal(plan.extrema(1).maximum, expected)
     assert evaluated == []
     assert plan.peak(1) == pytest.approx(np.abs(plan(np.linspace(0, 2, 20001), 1)).max(), rel=1e-7)
+
+
+@pytest.mark.parametrize("start", [0.0, 40.0, 1e6])
+@pytest.mark.parametrize("n", [2, 5, 12])
+def test_extrema_of_a_retimed_piecewise_spline_are_those_of_its_samples(n, start):
+    rng = np.random.default_rng(n)
+    times = start + np.cumsum(rng.uniform(0.3, 2.0, n))
+    points = [
+        Waypoint(float(t), rng.normal(size=2), *([[0.0, 0.0]] if i in (0, n - 1) else [])) for i, t in enumerate(times)
+    ]
+    plan = PiecewiseSpline(points, warn=False)
+    for order in range(4):
+        plan.extrema(order)  # its places are kept
+    moved = plan.retime(0.37 * plan.duration)
+    for order in range(4):
+        found = moved.extrema(order)
+        sampled = [
+            moved.segment_jet(k, np.linspace(0.0, float(b - a), 4001), order)[order]
+            for k, (a, b) in enumerate(zip(moved.breakpoints[:-1], moved.breakpoints[1:], strict=True))
+        ]
+        values, size = np.concatenate(sampled, axis=-1), plan.peak(order) / 0.37**order
+        assert (found.maximum >= values.max(axis=-1) - 1e-13 * size).all()
+        assert (found.minimum <= values.min(axis=-1) + 1e-13 * size).all()
+        assert (found.maximum <= values.max(axis=-1) + 1e-5 * size).all()
+        assert (found.minimum >= values.min(axis=-1) - 1e-5 * size).all()
