@@ -142,14 +142,16 @@ class Pieces:
         low, high = np.broadcast_arrays(low, high)
         rising = self(high) > self(low)
         s = (low + high) / 2
+        found = np.zeros(s.shape, dtype=np.bool_)
         for _ in range(60):  # Newton's method with bisection, which alone would converge in as many
             above = (self(s) > level) == rising
             low, high = np.where(above, low, s), np.where(above, s, high)
             newton = s - (self(s) - level) / self.slope(s)
             new = np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
-            if (np.abs(new - s) <= 1e-15).all():
+            found |= np.abs(new - s) <= 1e-15
+            if found.all():
                 break
-            s = new
+            s = np.where(found, s, new)  # a root is the same with others in the same call
         return s
 
     def square(self) -> Array:
