@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.metrics._pieces import Pieces, blocks, pieces
-from ctrlplan.metrics._records import QUIET, Array, Value, diverged, each, instant, plain, signal, times
+from ctrlplan.metrics._pieces import NOWHERE, Pieces, blocks, joined, pieces
+from ctrlplan.metrics._records import QUIET, Array, Value, diverged, instant, plain, signal, times
 
 
 def iae(timepts: ArrayLike, error: ArrayLike) -> Value:
@@ -44,7 +44,7 @@ def iae(timepts: ArrayLike, error: ArrayLike) -> Value:
     """
     t = times(timepts)
     e = signal(error, "error", t)
-    return each(lambda e: _absolute(t, e), e.shape[:-1], e)
+    return _absolute(t, e)
 
 
 def itae(timepts: ArrayLike, error: ArrayLike, start: float | None = None) -> Value:
@@ -85,7 +85,7 @@ def itae(timepts: ArrayLike, error: ArrayLike, start: float | None = None) -> Va
     t = times(timepts)
     e = signal(error, "error", t)
     since = instant(start, t)
-    return each(lambda e: _absolute(t, e, since), e.shape[:-1], e)
+    return _absolute(t, e, since)
 
 
 def ise(timepts: ArrayLike, error: ArrayLike) -> Value:
@@ -136,16 +136,37 @@ def squared(t: Array, f: Array) -> Value:
     return plain(values, f.shape[:-1])
 
 
-def _absolute(t: Array, f: Array, since: float | None = None) -> float:
-    """Return the integral of abs(f), weighted by the time after `since` if given."""
-    if diverged(f):
-        return np.inf
-    plain, crossed = pieces(t, f).signed
-    return _weighted(plain, plain.whole(), since) + _weighted(crossed, crossed.splits, since)
+def _absolute(t: Array, f: Array, since: float | None = None) -> Value:
+    """Return the integrals of abs(f), shape (...), weighted by the time after `since` if given."""
+    rows = f.reshape(-1, t.size)
+    values, near, others = np.full(len(rows), np.inf), [NOWHERE], list[Pieces]()
+    begin = -np.inf if since is None else since
+    with np.errstate(**QUIET):
+        for i, row in enumerate(rows):
+            if diverged(row):
+                continue
+            p = pieces(t, row)
+            direct = p.keeps_sign & (p.begin >= begin)
+            areas = p.mean if since is None else (p.begin - since) * p.mean + p.step * p.moment
+            values[i] = np.sum((p.step * np.abs(areas))[direct])
+            others.append(p[~direct])
+            near.append(np.full(others[-1].a.size, i))
+        if others:
+            np.add.at(values, np.concatenate(near), _areas(joined(others), since))
+    return plain(values, f.shape[:-1])
 
 
-def _weighted(p: Pieces, cuts: Array, since: float | None) -> float:
+def _areas(p: Pieces, since: float | None) -> Array:
+    """Return the same integrals of each interval, shape (m,), by quadrature between its zeros."""
+    mixed, areas = p.mixed, np.empty(p.a.size)
+    crossed, others = p[mixed], p[~mixed]
+    areas[~mixed] = _weighted(others, others.whole(), since)
+    areas[mixed] = _weighted(crossed, crossed.splits, since)
+    return areas
+
+
+def _weighted(p: Pieces, cuts: Array, since: float | None) -> Array:
     if since is None:
-        return p.integral(cuts, lambda s: np.abs(p.held(s)))
+        return p.integrals(cuts, lambda s: np.abs(p.held(s)))
     cuts = np.maximum(cuts, np.clip((since - p.begin) / p.step, 0.0, 1.0))
-    return p.integral(cuts, lambda s: (p.time(s) - since) * np.abs(p.held(s)))
+    return p.integrals(cuts, lambda s: (p.time(s) - since) * np.abs(p.held(s)))

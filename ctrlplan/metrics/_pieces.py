@@ -16,7 +16,7 @@ there, with dynamics that samples as far apart as its time constants do not show
 from the extrapolated curvature alone, is therefore no overshoot of a response.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -105,10 +105,28 @@ class Pieces:
         return values
 
     @cached_property
-    def signed(self) -> "tuple[Pieces, Pieces]":
-        """Return the intervals of constant sign and those with a zero inside."""
-        mixed = (self.values.min(axis=0) < 0) & (self.values.max(axis=0) > 0) & ~self.jump
-        return self[~mixed], self[mixed]
+    def keeps_sign(self) -> NDArray[np.bool_]:
+        """Return which intervals are known to be of one sign by their Bernstein coefficients; none with a jump."""
+        third = self.b / 3
+        early, late = self.a + third, self.a + 2 * third + self.c / 3
+        low = np.minimum(np.minimum(self.a, self.end), np.minimum(early, late))
+        high = np.maximum(np.maximum(self.a, self.end), np.maximum(early, late))
+        return ((low >= 0) | (high <= 0)) & ~self.jump
+
+    @cached_property
+    def mean(self) -> Array:
+        """Return the integrals over s, shape (m,)."""
+        return self.a + self.b / 2 + self.c / 3 + self.d / 4
+
+    @property
+    def moment(self) -> Array:
+        """Return the integrals of s times the cubics over s, shape (m,)."""
+        return self.a / 2 + self.b / 3 + self.c / 4 + self.d / 5
+
+    @property
+    def mixed(self) -> NDArray[np.bool_]:
+        """Return which intervals have values of both signs; none with a jump."""
+        return (self.values.min(axis=0) < 0) & (self.values.max(axis=0) > 0) & ~self.jump
 
     @cached_property
     def splits(self) -> Array:
@@ -124,14 +142,16 @@ class Pieces:
         low, high = np.broadcast_arrays(low, high)
         rising = self(high) > self(low)
         s = (low + high) / 2
+        found = np.zeros(s.shape, dtype=np.bool_)
         for _ in range(60):  # Newton's method with bisection, which alone would converge in as many
             above = (self(s) > level) == rising
             low, high = np.where(above, low, s), np.where(above, s, high)
             newton = s - (self(s) - level) / self.slope(s)
             new = np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
-            if (np.abs(new - s) <= 1e-15).all():
+            found |= np.abs(new - s) <= 1e-15
+            if found.all():
                 break
-            s = new
+            s = np.where(found, s, new)  # a root is the same with others in the same call
         return s
 
     def square(self) -> Array:
@@ -146,11 +166,21 @@ class Pieces:
 
     def integral(self, cuts: Array, integrand: Callable[[Array], Array]) -> float:
         """Return the integral over time of a function of s, between successive cuts, shape (ncuts, m)."""
+        return float(self.integrals(cuts, integrand).sum())
+
+    def integrals(self, cuts: Array, integrand: Callable[[Array], Array]) -> Array:
+        """Return the same for each interval, shape (m,)."""
         width = np.diff(cuts, axis=0)
-        total = 0.0
+        total = np.zeros(width.shape)
         for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-            total += weight * float(np.sum(self.step * width * integrand(cuts[:-1] + node * width)))
-        return total
+            total += weight * integrand(cuts[:-1] + node * width)
+        return np.sum(self.step * width * total, axis=0)
+
+
+def joined(parts: Sequence[Pieces]) -> Pieces:
+    """Return the pieces of several signals as one."""
+    names = Pieces.__dataclass_fields__
+    return Pieces(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 @contextmanager

@@ -281,9 +281,14 @@ class Experiment(Displayed):
         params : mapping, optional
             Parameters of the loop's blocks in addition to those of the experiment.
         """
+        run = self.simulated(loop, name, params)
+        return run, self._metrics(run)
+
+    def simulated(self, loop: System | Builder, name: str, params: Params | None = None) -> Run:
+        """Simulate a loop with one of the plans; arguments as for `run_plan`."""
         plan = self.plans[name]
         merged = self.params if params is None else {**(self.params or {}), **params}
-        run = run_plan(
+        return run_plan(
             loop,
             name,
             plan,
@@ -296,7 +301,6 @@ class Experiment(Displayed):
             params=merged,
             events=self.events,
         )
-        return run, self._metrics(run)
 
     def numbers_of(self, loop: System | Builder) -> Linear | None:
         """Matrices of a linear loop, for `run_alike`.
@@ -317,8 +321,7 @@ class Experiment(Displayed):
         """First positions of the plans, for the equilibria of linear loops; None if loops cannot be run together."""
         times = self.timepts
         ordered = times.ndim == 1 and times.size > 1 and np.isfinite(times).all() and np.all(np.diff(times) > 0.0)
-        own = any(isinstance(measure, Measure) for measure in self.measures or ())
-        if not ordered or self.events or self.params or own or self._listed("run"):
+        if not ordered or self.events or self.params or self.has_own_measures:
             return None
         return {name: plan.jet(times[:1], 0, left=True)[0, :, 0] for name, plan in self.plans.items()}
 
@@ -343,7 +346,7 @@ class Experiment(Displayed):
         alike = [loop for loop in numbers if loop is not None]
         if not alike or len(alike) < len(numbers) or not all(loop.fits(alike[0]) for loop in alike):
             return None
-        tracked, wanted = alike[0].tracked, wanted_measures(self.measures)
+        tracked = alike[0].tracked
         acting = alike[0].acting if samples is not None or self._listed("control") else ()
         signals, unstable = outputs_together(alike, (*tracked, *acting), self.plans, self.timepts)
         found: list[Metrics] = [{} for _ in alike]
@@ -353,12 +356,34 @@ class Experiment(Displayed):
             for i, curves in enumerate(stored) if samples is not None else ():
                 curves[name] = dict(zip((*tracked, *acting), rows[i][:, samples], strict=True))
             y, u = np.split(rows, [len(tracked)], axis=1)
-            record = SignalRecord(self.timepts, y, u, self.axes, acting, unstable)
-            values = signal_metrics(record, plan, self.since, self.band, wanted)
-            of_path = path_metrics(plan, self.waypoints, wanted)
-            for i, metrics in enumerate(found):
-                metrics[name] = {key: float(row[i]) for key, row in values.items()} | of_path
+            values = self._metrics_of_rows(SignalRecord(self.timepts, y, u, self.axes, acting, unstable), plan)
+            for metrics, own in zip(found, values, strict=True):
+                metrics[name] = own
         return [Measured(metrics, signals=curves) for metrics, curves in zip(found, stored, strict=True)]
+
+    def metrics_of_runs(self, runs: Sequence[Run]) -> list[dict[str, float]]:
+        """Metrics of runs of one loop with one plan and different parameters; without measures of the user."""
+        first = runs[0]
+        whole = all(np.array_equal(run.t, self.timepts) for run in runs)
+        same = first.plan.naxes == len(self.axes) and all(run.controls == first.controls for run in runs)
+        if len(runs) == 1 or not whole or not same or np.count_nonzero(first.t >= self.since) < 2:
+            return [self._metrics(run) for run in runs]
+        y = np.stack([run.rows(run.outputs) for run in runs])
+        u = np.stack([run.rows(run.controls) for run in runs])
+        unstable = np.array([run.is_unstable for run in runs])
+        return self._metrics_of_rows(SignalRecord(first.t, y, u, self.axes, first.controls, unstable), first.plan)
+
+    def _metrics_of_rows(self, record: SignalRecord, plan: Trajectory) -> list[dict[str, float]]:
+        """Metrics of each loop of a record, and of the path of the plan."""
+        wanted = wanted_measures(self.measures)
+        values = signal_metrics(record, plan, self.since, self.band, wanted)
+        of_path = path_metrics(plan, self.waypoints, wanted)
+        return [{key: float(row[i]) for key, row in values.items()} | of_path for i in range(len(record.y))]
+
+    @property
+    def has_own_measures(self) -> bool:
+        """Whether there are measures of the user, or measures of runs."""
+        return any(isinstance(measure, Measure) for measure in self.measures or ()) or self._listed("run")
 
     def _metrics(self, run: Run) -> dict[str, float]:
         """Metrics of a run, up to its end."""

@@ -540,12 +540,12 @@ def _rows(signals: Array) -> list[Array]:
 
 def _tracked(t: Array, y: Array, plan: Trajectory, band: float, start: float) -> list[Tracked]:
     """Arguments of measures of responses, for each of `_rows`."""
-    plans = [plan] if len(y) == 1 or plan.naxes == 1 else [plan.select([label]) for label in plan.labels]
+    reference, extrema = plan.jet(t, 0)[0], plan.extrema()
+    span = np.maximum(extrema.maximum - extrema.minimum, np.abs(plan.final - plan.initial))
     found = []
-    for one, rows in zip(plans, _rows(y), strict=True):
-        extrema = one.extrema()
-        span = np.maximum(extrema.maximum - extrema.minimum, np.abs(one.final - one.initial))
-        found.append(Tracked(t, rows, one.jet(t, 0)[0], one.initial, one.final, span, band, start))
+    for k, rows in enumerate(_rows(y)):
+        own = slice(None) if len(y) == 1 else slice(k, k + 1)
+        found.append(Tracked(t, rows, reference[own], plan.initial[own], plan.final[own], span[own], band, start))
     return found
 
 

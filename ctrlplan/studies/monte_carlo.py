@@ -31,7 +31,8 @@ from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.executing import Execution, executed
 from ctrlplan.studies.executors import Executor
 from ctrlplan.studies.experiment import Experiment
-from ctrlplan.studies.measures import Measure, shown_measures
+from ctrlplan.studies.measured_together import MeasuredTogether
+from ctrlplan.studies.measures import Measure, Run, shown_measures
 from ctrlplan.studies.outcomes import Failed, OneByOne, Runs, tried
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
@@ -231,17 +232,24 @@ def _outcome(
     params: Params | None,
 ) -> Outcome:
     """Outcome of one draw, by plan."""
-    wanted = experiment.timepts[samples]
 
     def measured(plan: str) -> tuple[dict[str, float], dict[str, Array]]:
-        form = forms[plan]
-        with DELEGATED if isinstance(form, Prepared) and form.network is None else nullcontext():
-            run, metrics = experiment.run_plan(form, plan, params)
-        stored = np.isin(run.t, wanted)
-        names = dict.fromkeys((*run.outputs, *run.controls))
-        return metrics, {name: run.signals[name][stored] for name in names}
+        run = _run(forms[plan], experiment, plan, params)
+        (metrics,) = experiment.metrics_of_runs([run])
+        return metrics, _curves(experiment, samples, run)
 
     return {plan: tried(measured, plan) for plan in plans}
+
+
+def _run(form: System | Builder, experiment: Experiment, plan: str, params: Params | None) -> Run:
+    with DELEGATED if isinstance(form, Prepared) and form.network is None else nullcontext():
+        return experiment.simulated(form, plan, params)
+
+
+def _curves(experiment: Experiment, samples: Samples, run: Run) -> dict[str, Array]:
+    """Outputs and controls of a run at the samples of the bands."""
+    stored = np.isin(run.t, experiment.timepts[samples])
+    return {name: run.signals[name][stored] for name in dict.fromkeys((*run.outputs, *run.controls))}
 
 
 @dataclass(frozen=True)
@@ -380,9 +388,20 @@ class _Prepared:
         light = _light(self.forms, drawn[0])
         again = None if light is None else self.forms
         if not elsewhere:
-            return OneByOne(partial(_of_forms, light or self.forms, experiment, samples)), again
+            return _draws_of(light or self.forms, experiment, samples), again
         sent = _Sent(light or (self.loop if is_builder(self.loop) else self.forms))
         return OneByOne(partial(_elsewhere, sent, experiment, samples)), again
+
+
+def _draws_of(forms: Forms, experiment: Experiment, samples: Samples) -> Runs[Draw, Outcome]:
+    """Runs of draws in this process."""
+    if experiment.has_own_measures:
+        return OneByOne(partial(_of_forms, forms, experiment, samples))
+    return MeasuredTogether(experiment, partial(_runs_of, forms, experiment), partial(_curves, experiment, samples))
+
+
+def _runs_of(forms: Forms, experiment: Experiment, params: Draw) -> dict[str, Run | Failed]:
+    return {plan: tried(lambda name: _run(forms[name], experiment, name, params), plan) for plan in experiment.plans}
 
 
 def _of_forms(forms: Forms, experiment: Experiment, samples: Samples, params: Draw) -> Outcome:

@@ -100,3 +100,24 @@ def test_integrals_do_not_mind_the_direction_of_time(e):
         assert metric(t, e[::-1]) == pytest.approx(metric(t, e), rel=1e-9, abs=1e-9)
     together = metrics.itae(t, e) + metrics.itae(t, e[::-1])
     assert together == pytest.approx(t[-1] * metrics.iae(t, e), rel=1e-9, abs=1e-9)
+
+
+def test_absolute_integrals_of_several_signals_together():
+    """A parabola with two zeros inside intervals, a signal of one sign, and one that has diverged."""
+    t = np.linspace(0, 4, 801)
+    a, b, since = 1.2345, 2.3456, 1.7777
+    parabola, positive = (t - a) * (t - b), 1 + t**3
+    found = metrics.iae(t, np.array([[parabola, positive], [-parabola, np.where(t > 3, np.inf, t)]]))
+
+    def area(s):
+        return s**3 / 3 - (a + b) * s**2 / 2 + a * b * s
+
+    def moment(s):
+        return s**4 / 4 - (a + b + since) * s**3 / 3 + (a * b + since * (a + b)) * s**2 / 2 - since * a * b * s
+
+    whole = 2 * (area(a) - area(b)) + area(4)
+    np.testing.assert_allclose(found, [[whole, 68], [whole, np.inf]], rtol=1e-13)
+    found = metrics.itae(t, np.array([parabola, positive]), start=since)
+    below = moment(since) + moment(4) - 2 * moment(b)
+    above = (16 - since**2) / 2 - since * (4 - since) + (4**5 - since**5) / 5 - since * (4**4 - since**4) / 4
+    np.testing.assert_allclose(found, [below, above], rtol=1e-13)

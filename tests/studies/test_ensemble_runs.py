@@ -292,16 +292,16 @@ def test_answers_need_not_be_cancelled():
 def interrupt_in_draw(monkeypatch, k):
     """Interrupt the run of draw k in this process."""
     module = importlib.import_module("ctrlplan.studies.monte_carlo")
-    known = module._of_forms
+    known = module._run
     done = []
 
     def one(*arguments):
         done.append(arguments)
-        if len(done) == k + 3:  # two before all draws
+        if len(done) == len(PLANS) * (k + 2) + 1:  # two before all draws
             raise KeyboardInterrupt
         return known(*arguments)
 
-    monkeypatch.setattr(module, "_of_forms", one)
+    monkeypatch.setattr(module, "_run", one)
 
 
 @pytest.mark.slow
