@@ -218,9 +218,9 @@ class Region:
     >>> cp.margins(
     ...     cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 30, 0, 0)], labels=["angle"]),
     ...     {"motor": cp.Region(("angle_d1", "torque"), corners)},
-    ...     lambda jet: {"torque": 0.01 * jet[2, 0]},
+    ...     lambda jet: {"torque": 0.01 * jet[2, 0] + 0.004 * jet[1, 0]},
     ... )
-    <Margins of 4 limits: motor: torque + 0.03 angle_d1 at most 3: 2.70288 at 0.297489 s, 9.9 % left>
+    <Margins of 4 limits: motor: torque + 0.03 angle_d1 at most 3: 2.86326 at 0.307832 s, 4.56 % left>
     """
 
     signals: tuple[str, str]
