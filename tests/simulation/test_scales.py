@@ -326,15 +326,15 @@ def test_a_large_state_that_nothing_depends_on_is_not_integrated_more_closely():
 
 def test_a_state_held_at_zero_by_others_has_no_smaller_scale_than_their_errors():
     """x0 = 10 rounds to 1e-15 and feeds x1 with slope 2: x1 is rounding, and its scale does not follow it to zero."""
-    noise, eps = np.array([1e-14, 0.0]), 1e-15
+    noise, eps, both = np.array([1e-14, 0.0]), 1e-15, np.arange(2)
     scales = Scales.plain(2, None)
     for size in (1e-15, 1e-19, 1e-24):
         states = np.array([[10.0, 10.0 + eps, 10.0], [0.0, size, -size]])
-        found = scales.renewed(states, lambda: noise, lambda errors: np.array([0.0, 2.0 * errors[0]]))
+        found = scales.renewed(states, both, lambda: noise, lambda errors: np.array([0.0, 2.0 * errors[0]]))
         scales = scales if found is None else found
         assert scales.scale[0] == pytest.approx(1e-3)  # 1e11 times the noise
         assert scales.scale[1] == pytest.approx(2e-6)  # a thousandth of what that displaces it by
     # A small motion of its own, which no other state feeds, is resolved.
     states = np.array([[10.0, 10.0 + eps, 10.0], [0.0, 1e-19, -1e-19]])
-    found = Scales.plain(2, None).renewed(states, lambda: noise, np.zeros_like)
+    found = Scales.plain(2, None).renewed(states, both, lambda: noise, np.zeros_like)
     assert found.scale[1] == pytest.approx(1e-19)
