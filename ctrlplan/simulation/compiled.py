@@ -28,8 +28,8 @@ _CACHE_SIZE = 64
 """Number of cached integrators, one for each pattern of output times, and of cached functions of many times."""
 
 _DIGITS, _NEAR, _EVEN = 12, 1e-9, 1e-4
-"""Digits of output times in units of a segment; the smallest interval between them above which they are rounded to
-these digits, in units of the segment and of the largest interval."""
+"""Digits of output times in units of a segment. They are rounded to these digits if their smallest interval is above
+the second number, and the first one, where transients are fast, above the third in units of the largest."""
 
 _CLOSEST, _EQUAL = 1e-8, 8.0
 """Interval between output times, in units of a segment, below which the segment is divided there (CasADi returns the
@@ -527,7 +527,7 @@ def _pattern(relative: Array) -> Array:
     """Relative output times of a segment; rounded, as rounding errors of time must not require a new integrator."""
     rounded = np.round(relative, _DIGITS)
     gaps = np.diff(rounded, prepend=0.0)
-    return rounded if gaps.min() > max(_NEAR, _EVEN * gaps.max()) else relative
+    return rounded if gaps.min() > _NEAR and gaps[0] > _EVEN * gaps.max() else relative
 
 
 def _resolved(left: float, grid: Array) -> int:
