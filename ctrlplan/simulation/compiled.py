@@ -526,8 +526,9 @@ def _called(function: ca.Function, arguments: Sequence[Array], nrows: int) -> Ar
 def _pattern(relative: Array) -> Array:
     """Relative output times of a segment; rounded, as rounding errors of time must not require a new integrator."""
     rounded = np.round(relative, _DIGITS)
-    gaps = np.diff(rounded, prepend=0.0)
-    return rounded if gaps.min() > _NEAR and gaps[0] > _EVEN * gaps.max() else relative
+    gaps = np.diff(rounded)
+    first = rounded[np.flatnonzero(rounded)[0]]  # an output time may equal the start to rounding
+    return rounded if gaps.min() > _NEAR and first > _EVEN * gaps.max() else relative
 
 
 def _resolved(left: float, grid: Array) -> int:
