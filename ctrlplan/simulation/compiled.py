@@ -31,7 +31,7 @@ _DIGITS, _NEAR, _EVEN = 12, 1e-9, 1e-4
 """Digits of output times in units of a segment. They are rounded to these digits if their smallest interval is above
 the second number, and the first one, where transients are fast, above the third in units of the largest."""
 
-_CLOSEST, _EQUAL = 1e-8, 8.0
+_CLOSEST, _EQUAL = 1e-8, 64.0
 """Interval between output times, in units of a segment, below which the segment is divided there (CasADi returns the
 state before an interval of less than 1e-9), unless they are equal up to so many units in the last place."""
 
@@ -536,7 +536,7 @@ def _resolved(left: float, grid: Array) -> int:
     if grid.size < 2:
         return grid.size
     gaps = np.diff(grid, prepend=left)
-    gaps[gaps <= _EQUAL * np.spacing(abs(grid[-1]))] = np.inf
+    gaps[gaps <= _EQUAL * np.spacing(np.abs(grid))] = np.inf
     if gaps.min() >= _CLOSEST * (grid[-1] - left):
         return grid.size
     close = np.minimum.accumulate(gaps) < _CLOSEST * (grid - left)
