@@ -27,8 +27,13 @@ from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 _CACHE_SIZE = 64
 """Number of cached integrators, one for each pattern of output times, and of cached functions of many times."""
 
-_DIGITS, _NEAR = 12, 1e-9
-"""Digits of output times in units of a segment, and their distance above which they are rounded to these digits."""
+_DIGITS, _NEAR, _EVEN = 12, 1e-9, 1e-4
+"""Digits of output times in units of a segment. They are rounded to these digits if their smallest interval is above
+the second number, and the first one, where transients are fast, above the third in units of the largest."""
+
+_CLOSEST, _EQUAL = 1e-8, 64.0
+"""Interval between output times, in units of a segment, below which the segment is divided there (CasADi returns the
+state before an interval of less than 1e-9), unless they are equal up to so many units in the last place."""
 
 _FEW_STEPS = 2_000
 """Maximum number of steps between outputs in the first attempt."""
@@ -405,6 +410,18 @@ class CompiledSolver:
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment; the last is its end."""
+        count = _resolved(left, grid)
+        if count == grid.size:
+            return self._advanced(series, left, grid, state)
+        parts = list[Array]()
+        while grid.size:
+            parts.append(self._advanced(series, left, grid[:count], state))
+            left, state, grid = float(grid[count - 1]), parts[-1][:, -1], grid[count:]
+            count = _resolved(left, grid)
+        return np.concatenate(parts, axis=1)
+
+    def _advanced(self, series: Series, left: float, grid: Array, state: Array) -> Array:
+        """The same for times that are not too close together."""
         moving = self.form.moving
         out = np.empty((state.size, grid.size))
         out[:] = state[:, None]
@@ -419,7 +436,7 @@ class CompiledSolver:
         settings = self._settings(series, relative)
         if self._is_rare(settings, grid.size):
             for k in range(grid.size):
-                out[:, k] = self.advance(series, left, grid[k : k + 1], state)[:, 0]
+                out[:, k] = self._advanced(series, left, grid[k : k + 1], state)[:, 0]
             return out
         if series is not self._series:
             parts = [self._p, series.coefficients.ravel(order="F"), series.low, series.high, self._shift, self._scale]
@@ -509,7 +526,21 @@ def _called(function: ca.Function, arguments: Sequence[Array], nrows: int) -> Ar
 def _pattern(relative: Array) -> Array:
     """Relative output times of a segment; rounded, as rounding errors of time must not require a new integrator."""
     rounded = np.round(relative, _DIGITS)
-    return rounded if np.diff(rounded).min() > _NEAR else relative
+    gaps = np.diff(rounded)
+    first = rounded[np.flatnonzero(rounded)[0]]  # an output time may equal the start to rounding
+    return rounded if gaps.min() > _NEAR and first > _EVEN * gaps.max() else relative
+
+
+def _resolved(left: float, grid: Array) -> int:
+    """Number of output times of a segment from `left` to the last of them that CVODES distinguishes."""
+    if grid.size < 2:
+        return grid.size
+    gaps = np.diff(grid, prepend=left)
+    gaps[gaps <= _EQUAL * np.spacing(np.abs(grid))] = np.inf
+    if gaps.min() >= _CLOSEST * (grid[-1] - left):
+        return grid.size
+    close = np.minimum.accumulate(gaps) < _CLOSEST * (grid - left)
+    return max(1, int(close.argmax()))
 
 
 def _feedthrough(block: Block, trace: Trace | None) -> NDArray[np.bool_]:

@@ -128,9 +128,19 @@ def _quantiles(rows: Array) -> Array:
         for full in (True, False):
             columns = known.all(axis=0) if full else known.any(axis=0) & ~known.all(axis=0)
             if columns.any():
-                quantile = np.quantile if full else np.nanquantile
-                out[:, k : k + _COLUMNS][:, columns] = quantile(some[:, columns], LEVELS, axis=0)
+                out[:, k : k + _COLUMNS][:, columns] = _levels(some[:, columns], full)
     return out
+
+
+def _levels(rows: Array, full: bool) -> Array:
+    """Quantiles (nlevels, ntime) of columns; infinite between a finite and an infinite value."""
+    quantile = np.quantile if full else np.nanquantile
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = quantile(rows, LEVELS, axis=0)
+        if np.isnan(found).any():  # of a diverging loop
+            low, high = (quantile(rows, LEVELS, axis=0, method=method) for method in ("lower", "higher"))
+            found = np.where(np.isnan(found), np.where(low == high, low, low + high), found)
+    return np.asarray(found)
 
 
 def band_samples(times: Array, draws: int, curves: int) -> NDArray[np.intp]:

@@ -122,3 +122,24 @@ def test_samples_constants_and_a_plan_together(method):
         out.append(float(x[0]))
     found = cp.simulate(block, times, {"a": a, "b": 2.0, "c": cp.Step(3.0, time=5.31)}, method=method)
     assert np.abs(found.outputs - out).max() <= 1e-8
+
+
+def logistic(rate):
+    """x' = rate x (1 - x), from x = 1/2: x = 1/(1 + exp(-rate t))."""
+    return ct.nlsys(lambda t, x, u, p: [rate * x[0] * (1.0 - x[0])], None, inputs=0, outputs=["y"], states=1)
+
+
+@pytest.mark.parametrize("exponent", [3, 5, 8])
+def test_times_over_many_decades(exponent):
+    """Logarithmic times from the fast beginning to the end of a long run."""
+    times, rate = np.append(0.0, np.logspace(-5, exponent, 53)), 3e3
+    found = cp.simulate(logistic(rate), times, initial_state=[0.5], method="compiled")
+    np.testing.assert_allclose(found.outputs[0], 1.0 / (1.0 + np.exp(-rate * times)), rtol=0.0, atol=1e-8)
+
+
+def test_times_that_nearly_coincide():
+    """Pairs of times apart by rounding, and by less than the integrator distinguishes in the whole run."""
+    near = np.outer([0.3, 0.5, 0.9], [1.0, 1.0 + 3e-16, 1.0 + 1e-12, 1.0 + 5e-10]).ravel()
+    times = np.unique([0.0, *near, 1.0])
+    found = cp.simulate(logistic(5.0), times, initial_state=[0.5], method="compiled")
+    np.testing.assert_allclose(found.outputs[0], 1.0 / (1.0 + np.exp(-5.0 * times)), rtol=0.0, atol=1e-8)

@@ -2,7 +2,9 @@
 
 import json
 import math
+import warnings
 
+import control as ct
 import numpy as np
 import pytest
 from ensemble_cases import LAGS, PLANS, TIMES, block, lag, lag_response, run
@@ -361,3 +363,21 @@ def test_a_metric_may_be_known_of_one_plan_only():
 
     result = run(lag(), {"tau": [0.5, 1.0, 2.0]}, measures=[cp.Measure("last", of="run", function=last)])
     np.testing.assert_allclose(result.quantiles("last")["step"][2], 1 - math.exp(-10), rtol=1e-6)
+
+
+def test_bands_of_a_loop_that_diverges_in_some_draws_are_infinite():
+    """y' = (r - y)/tau with the step: where tau = -1/400, -inf is reached within 2 s; no level is nan."""
+
+    def build(rate):
+        return ct.ss([[-rate]], [[rate]], [[1.0]], [[0.0]], inputs="r", outputs="y", name="lag")
+
+    rates = np.array([1.0, -400.0, 2.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = cp.monte_carlo(build, {"rate": rates}, {"step": cp.Step(1.0)}, TIMES, progress=False)
+    band, last = found.bands["step"]["y"], float(found.timepts[-1])
+    assert not np.isnan(band).any()
+    # Levels 0.05 and 0.25 are between the smallest value and the next one, level 0.5 is that one.
+    assert band[:2, -1].tolist() == [-math.inf] * 2
+    stable = 1.0 - np.exp(-np.array([1.0, 2.0]) * last)
+    np.testing.assert_allclose(band[2:, -1], np.interp([0.0, 0.5, 0.9], [0.0, 1.0], stable), rtol=1e-9)
