@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 _SAMPLES = 193
 _ROUNDING = 1e-9  # fraction of a limit below which a margin is printed as 0
+_EQUAL = 1e-12  # difference of the margins to both limits below which the upper one is given
 _FAR = 100.0
 """Distance from limits over time, in their scale, beyond which it is not resolved."""
 _RATE_STEP = 0.02
@@ -928,5 +929,6 @@ def _axis_margin(bound: Bound, extrema: Extrema) -> Margin:
 def _margin(bound: Bound, minimum: float, maximum: float, time_min: float, time_max: float) -> Margin:
     """Margin to the nearer of both limits."""
     low, high = ((side / bound.scale + bound.slack) for side in (minimum - bound.low, bound.high - maximum))
-    value, time, fraction = (minimum, time_min, low) if low < high else (maximum, time_max, high)
+    # Equal but for rounding, they count as equal: the result does not depend on the processor.
+    value, time, fraction = (minimum, time_min, low) if low < high - _EQUAL else (maximum, time_max, high)
     return Margin(bound, float(value), float(time), float(fraction))
