@@ -423,6 +423,20 @@ def test_a_closed_plan_stays_closed_with_a_limited_fifth_derivative():
     assert np.abs(jet[5, 0]).max() <= 3e4 * (1 + 1e-9)
 
 
+@pytest.mark.slow
+def test_a_limited_sixth_derivative_is_satisfied_on_the_path():
+    """In less time than at fixed shape; the path remains."""
+    ends = [Waypoint.from_array(2.0 * k, k * np.eye(7, 1), None) for k in (0, 1)]
+    plan = cp.TrigSpline([ends[0], Waypoint(1, 0.3), ends[1]], alpha=1.0)
+    limits = {"velocity": 1.0, "y_d6": 500.0}
+    found, shape = fastest(plan, limits, hold="path"), fastest(plan, limits)
+    assert found.duration < 0.9 * shape.duration
+    peaks = np.abs(found.plan.jet(np.linspace(found.plan.start, found.plan.end, COUNT), 6)).max(axis=(1, 2))
+    assert peaks[1] <= 1.0 + 1e-9
+    assert 450.0 <= peaks[6] <= 500.0 * (1.0 + 1e-9)
+    assert found.plan(found.plan.end) == 1.0
+
+
 def test_a_time_law_with_a_limited_sixth_derivative_would_open_a_closed_plan():
     with pytest.raises(ValueError, match="hold must be 'shape' or 'waypoints' for a closed plan, got 'path'"):
         fastest(CYCLE, {"velocity": 2.0, "y1_d6": 3e6}, hold="path")
