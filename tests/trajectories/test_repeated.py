@@ -231,7 +231,10 @@ def test_exports(tmp_path):
     for ending in (".cam.csv", ".cam.st"):  # master positions of one period
         endless.export(tmp_path / f"a{ending}")
         CAM.export(tmp_path / f"b{ending}")
-        assert (tmp_path / f"a{ending}").read_bytes() == (tmp_path / f"b{ending}").read_bytes()
+        one, other = ((tmp_path / f"{name}{ending}").read_text().replace(",", " ").split() for name in "ab")
+        assert len(one) == len(other)
+        for first, second in zip(one, other, strict=True):  # equal but for rounding at the ends
+            assert first == second or abs(float(first) - float(second)) <= 1e-12
     endless.export(tmp_path / "a.ppoly.json")
     data = json.loads((tmp_path / "a.ppoly.json").read_text())
     spline, t = PPoly(data["c"], data["x"], extrapolate=data["extrapolate"]), RNG.uniform(0.3, 20.0, 50)
