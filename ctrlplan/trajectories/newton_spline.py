@@ -231,10 +231,7 @@ class NewtonSpline(WaypointSpline):
             if rows is not None:
                 return np.array(rows).T[:, :, None]
         found = self._jet(s, order)
-        for end in (0.0, self._moments[1] - self._moments[0]):
-            where = (s == end).nonzero()[0]
-            if where.size:
-                found[:, :, where] = self._end_jet(segment, end, order)[:, :, None]
+        self._place_ends(segment, s, 0, found)
         return found
 
     def _jet(self, s: Array, order: int) -> Array:

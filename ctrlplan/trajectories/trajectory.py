@@ -1168,11 +1168,15 @@ class Trajectory(Displayed, Fields, ABC):
         high = low + len(out) - 1
         length = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
         finite = _sampling.sample(jet, self._interpolant(segment, low, high), length, s, (low, high), out)
-        for end in (0.0, length):  # the ends have the entries of waypoints in every bit
+        self._place_ends(segment, s, low, out)
+        return finite
+
+    def _place_ends(self, segment: int, s: Array, low: int, out: Array) -> None:
+        """Replace derivatives at the ends of a segment: they are the entries of waypoints in every bit."""
+        for end in (0.0, float(self.breakpoints[segment + 1] - self.breakpoints[segment])):
             where = (s == end).nonzero()[0]
             if where.size:
-                out[:, :, where] = self._end_jet(segment, end, high)[low:, :, None]
-        return finite
+                out[:, :, where] = self._end_jet(segment, end, low + len(out) - 1)[low:, :, None]
 
     def _interpolant(self, segment: int, low: int, high: int) -> _sampling.Interpolant | None:
         """Interpolants of derivatives low to high on a segment; None where they are not resolved."""

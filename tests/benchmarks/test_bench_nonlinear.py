@@ -8,12 +8,12 @@ those of `simulate`, whose own are a hundredth of the requested ones.
 
 import math
 from itertools import pairwise
-from time import process_time
 
 import casadi as ca
 import control as ct
 import numpy as np
 import pytest
+from in_turn import in_turn
 from scipy.integrate import solve_ivp
 
 import ctrlplan as cp
@@ -24,14 +24,7 @@ ROUNDS = 5
 
 def interleaved(ours, peer, rounds=ROUNDS):
     """Minimum seconds of both, run in turn, and their last results."""
-    rows = []
-    for _ in range(rounds):
-        seconds, results = [], []
-        for function in (ours, peer):
-            begin = process_time()
-            results.append(function())
-            seconds.append(process_time() - begin)
-        rows.append(seconds)
+    rows, results = in_turn(ours, peer, rounds)
     return [min(column) for column in zip(*rows, strict=True)], results
 
 
@@ -66,10 +59,10 @@ def solved_by_cvodes(rates, state, times, breaks, tolerance, parameter=None):
 
     def run(value=0.0):
         x, rows = np.asarray(state), [np.asarray(state)[:, None]]
-        for integrator, asked in runs:
+        for integrator, chosen in runs:
             found = np.asarray(integrator(x0=x, **({} if parameter is None else {"p": value}))["xf"])
             x = found[:, -1]
-            rows.append(found[:, asked])
+            rows.append(found[:, chosen])
         return np.hstack(rows)
 
     return run

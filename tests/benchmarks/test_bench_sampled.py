@@ -6,11 +6,11 @@ matrices computed before, and makes one product a sample, or an instant: z = M z
 
 from collections import deque
 from statistics import median
-from time import process_time
 
 import control as ct
 import numpy as np
 import pytest
+from in_turn import in_turn
 from scipy.linalg import expm
 
 import ctrlplan as cp
@@ -46,14 +46,7 @@ def held(length):
 
 def interleaved(ours, peer):
     """Median seconds of both and of their ratio, run in turn, and the results of the last turn."""
-    rows = []
-    for _ in range(ROUNDS):
-        seconds, results = [], []
-        for function in (ours, peer):
-            begin = process_time()
-            results.append(function())
-            seconds.append(process_time() - begin)
-        rows.append(seconds)
+    rows, results = in_turn(ours, peer, ROUNDS)
     return [median(column) for column in zip(*rows, strict=True)], median(a / b for a, b in rows), results
 
 
