@@ -12,6 +12,7 @@ from uuid import uuid4
 
 import ctrlplan
 from ctrlplan._lru import Lru
+from ctrlplan.studies.interruption import holding_back
 from ctrlplan.studies.outcomes import Failed, Runs, ready
 
 T = TypeVar("T")
@@ -101,7 +102,8 @@ class Task(Generic[T, R]):
 
 def run_task(task: Task[T, R]) -> Reply[R]:
     """Run a task, in any process."""
-    return task.run()
+    with holding_back(False):  # an executor may run its tasks in this thread
+        return task.run()
 
 
 def _received(key: str, values: Sequence[T], timeout: float | None, runs: Runs[T, R] | None) -> Task[T, R]:

@@ -19,6 +19,7 @@ from ctrlplan.studies.executors import (
     new_pool,
     worker_count,
 )
+from ctrlplan.studies.interruption import holding_back
 from ctrlplan.studies.outcomes import Failed, Runs
 
 T = TypeVar("T")
@@ -156,18 +157,17 @@ class Dispatch(Generic[T, R]):
             carries = chunk.carries or self._carried < (self._workers or 1)
             sent = _Chunk(chunk.numbers, carries, self._pool)
             try:
-                future = self._sent(sent)
+                with holding_back():  # so that no task is with the executor and not known here
+                    self._futures.add(self._submitted, self._sent(sent))
+                    self._chunks[self._submitted] = sent
+                    self._submitted += 1
+                    self._carried += carries
             except (Exception, SystemExit) as error:  # of the executor: it is broken, or cannot send the task
                 failed = Failed.of(error, by_executor=True)
                 if not self._renewed(failed.error, self._pool):
                     self._give_up(failed, chunk)
                     return
                 self._waiting.appendleft(chunk)
-                continue
-            self._futures.add(self._submitted, future)
-            self._chunks[self._submitted] = sent
-            self._submitted += 1
-            self._carried += carries
 
     def _next(self) -> _Chunk | None:
         """Next task; one that was lost twice only when nothing is in flight."""

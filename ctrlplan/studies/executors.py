@@ -10,7 +10,7 @@ from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Generic, Protocol, TypeVar
 
-from ctrlplan.studies.interruption import raise_if_pressed
+from ctrlplan.studies.interruption import holding_back, raise_if_pressed
 from ctrlplan.studies.outcomes import Failed
 
 T = TypeVar("T")
@@ -113,7 +113,9 @@ class Futures(Generic[R]):
     def next(self) -> tuple[int, R | Failed]:
         """Wait for a future, and return its number with its result or the failure of the executor."""
         number = self._wait()
-        found = _outcome(self._futures[number])
+        future = self._futures[number]
+        with holding_back(number in self._watched or _is_done(future)):
+            found = _outcome(future)
         self._drop(number)  # so that its result can be freed
         return number, found
 

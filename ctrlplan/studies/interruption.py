@@ -12,6 +12,9 @@ from types import FrameType
 _PRESSED: ContextVar[Sequence[int]] = ContextVar("pressed", default=())
 """Signals of Ctrl-C since the runs began."""
 
+_HELD_BACK: ContextVar[bool] = ContextVar("held_back", default=False)
+"""Whether a first Ctrl-C is recorded only."""
+
 
 @contextmanager
 def counting_interruptions() -> Iterator[Sequence[int]]:
@@ -27,7 +30,8 @@ def counting_interruptions() -> Iterator[Sequence[int]]:
 
     def record(number: int, frame: FrameType | None) -> None:
         pressed.append(number)
-        signal.default_int_handler(number, frame)
+        if len(pressed) > 1 or not _HELD_BACK.get():
+            signal.default_int_handler(number, frame)
 
     token = _PRESSED.set(pressed)
     signal.signal(signal.SIGINT, record)
@@ -36,6 +40,29 @@ def counting_interruptions() -> Iterator[Sequence[int]]:
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         _PRESSED.reset(token)
+
+
+@contextmanager
+def holding_back(held: bool = True) -> Iterator[None]:
+    """Context in which a first Ctrl-C is raised at the end, and a second one at once.
+
+    For short calls of an executor that an exception in between would leave half
+    done: a client of dask, for one, then receives no further result. Runs
+    within such a call, of an executor that runs its tasks in this thread, are not
+    ``held``.
+    """
+    before = len(_PRESSED.get())
+    token = _HELD_BACK.set(held)
+    try:
+        yield
+    except Exception as error:
+        if len(_PRESSED.get()) > before:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        _HELD_BACK.reset(token)
+    if len(_PRESSED.get()) > before:
+        raise KeyboardInterrupt
 
 
 def raise_if_pressed() -> None:

@@ -16,7 +16,7 @@ import ctrlplan as cp
 
 PRELUDE = """
 import json, os, signal, sys, threading, time, warnings
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 import control as ct
@@ -175,6 +175,39 @@ mistaken = []
 found["mistaken"] = said_of(*swept(build, values))
 found["handler"] = signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
+class Fetched(Future):
+    def result(self, timeout=None):
+        requests.append("sent")
+        if len(requests) == 3 and where == "result":
+            interrupt()
+        found = super().result(timeout)
+        requests[-1] = "answered"
+        return found
+
+class Here:
+    # Runs tasks at once, and gives their results on request.
+    _max_workers = 1
+
+    def submit(self, function, *arguments):
+        taken.append("begun")
+        future = Fetched()
+        future.set_result(function(*arguments))
+        if len(taken) == 4 and where == "submit":
+            interrupt()
+        taken[-1] = "done"
+        return future
+
+def build(rate):
+    if rate == 4.0 and where == "run":
+        interrupt()
+        taken.append("goes on")
+    return lag(rate)
+
+for where in ("result", "submit", "run"):
+    requests, taken = [], []
+    found[f"in {where}"] = said_of(*swept(build, values, Here(), chunk=1))
+    found[f"calls in {where}"] = requests, taken
+
 class Again:
     def submit(self, function, *arguments):
         interrupt()
@@ -238,6 +271,16 @@ def test_signals_keep_what_is_finished_in_this_process_and_in_threads(tmp_path):
     assert (draws["interrupted"], draws["finished"], draws["failures"]) == (True, 7, [])
     assert draws["said"] == ["monte_carlo was interrupted: 7 of 20 draws are returned"]
     assert found["handler"]
+    for where, last, taken in (
+        ("result", 4, ["done"] * 4),
+        ("submit", 4, ["done"] * 4),
+        ("run", 3, ["done"] * 3 + ["begun"]),
+    ):
+        assert found[f"in {where}"]["settling"] == settling(range(1, last + 1))
+        assert found[f"in {where}"]["interrupted"]
+        requests, calls = found[f"calls in {where}"]
+        assert set(requests) == {"answered"}  # a client of dask with one that was broken off receives no more
+        assert calls == taken
     assert found["again"] == "returned"  # one signal alone, while tasks are handed out
     assert found["twice"] == found["twice at once"] == "raised"
 
@@ -364,7 +407,7 @@ class Seen:
 
     def tell(self, future):
         self.done.append(1)
-        if len(self.done) == 2:
+        if len(self.done) >= 2:
             (HERE / f"seen {self.name}").touch()
 
 def wait_for(name):
