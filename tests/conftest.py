@@ -10,6 +10,10 @@ import repetitions
 # Matrices are small here: more threads of BLAS only wait for each other, and tests run in several processes already.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Programs that tests start import compiled modules: to compile the package takes a second.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 collect_ignore = ["support"]  # no tests: what they import, under one name and not again as tests.support.NAME
 
 
