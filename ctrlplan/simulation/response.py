@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import control as ct
 from numpy.typing import ArrayLike
@@ -12,7 +13,9 @@ from numpy.typing import ArrayLike
 from ctrlplan._display import ROWS, Displayed, Facts, Part, Table, number, shortened
 from ctrlplan._types import Array
 from ctrlplan.simulation.events import Occurrence
-from ctrlplan.trajectories.export import SampledTable, export_table
+
+if TYPE_CHECKING:
+    from ctrlplan.trajectories.export import SampledTable
 
 
 class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] # python-control has no types
@@ -112,6 +115,8 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
         OSError
             If the file cannot be written; an existing file is then unchanged.
         """
+        from ctrlplan.trajectories.export import export_table
+
         return export_table(signal_table(self), path)
 
     def _describe(self) -> Iterator[Part]:
@@ -140,6 +145,8 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
 
 def signal_table(response: ct.TimeResponseData) -> SampledTable:
     """Outputs, inputs and states of a response by their labels."""
+    from ctrlplan.trajectories.export import SampledTable
+
     groups = {
         "output": (response.output_labels, response.y),
         "input": (response.input_labels, response.u),

@@ -20,16 +20,19 @@ from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
 from math import floor
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
-from ctrlplan.simulation.collocation import Collocation
 from ctrlplan.simulation.exact import state_scale
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, closed, linear_forms, singular_loop
 from ctrlplan.simulation.network import Block, Network
 from ctrlplan.simulation.segments import as_fraction
+
+if TYPE_CHECKING:
+    from ctrlplan.simulation.collocation import Collocation
 
 Timing = tuple[Fraction, Fraction]
 """Period and offset [s]: sample times are offset, offset + period, ... after the start of a run."""
@@ -317,6 +320,8 @@ class DelayedForm:
     @cached_property
     def collocation(self) -> Collocation:
         """Maps of parts of a run."""
+        from ctrlplan.simulation.collocation import Collocation
+
         columns = np.concatenate([self.delayed, self.given])
         from_z, from_w = (
             np.concatenate(rows) for rows in zip(*((x.from_z, x.from_w) for x in self.lates), strict=True)

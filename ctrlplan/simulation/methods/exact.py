@@ -10,7 +10,6 @@ import numpy as np
 
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array
-from ctrlplan.simulation.delayed_motion import DelayedMotion
 from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.exact import Jet, exact_states, sampled_states
 from ctrlplan.simulation.job import Job, Record, with_event_times
@@ -97,6 +96,8 @@ def _run_sampled(job: Job, form: SampledForm) -> Record:
 
 def _run_delayed(job: Job, form: DelayedForm) -> Record:
     """Record of a linear loop with delays between continuous blocks."""
+    from ctrlplan.simulation.delayed_motion import DelayedMotion  # few loops have delays
+
     check_periods([job.blocks.blocks[i] for i in job.blocks.blocks_with("period")], job.first, float(job.times[-1]))
     given = job.prepared.time_signals(job.inputs, job.first)
     motion = DelayedMotion(form, given, job.first, float(job.times[-1]), job.state)
