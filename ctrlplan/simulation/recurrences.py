@@ -140,14 +140,17 @@ class DelayLine:
         """Whether a value is taken from the first state."""
         return bool(self.places.size and self.places[0] == 0)
 
-    def returning(self, values: Array, which: NDArray[np.intp]) -> Array:
+    def returning(self, values: Array, some: slice) -> Array:
         """What returns (n, width) at some places."""
-        earlier = values[np.maximum(which - self.count, 0)]
-        return np.where((which < self.count)[:, None], self.initial, earlier)
+        begin, end = some.start - self.count, some.stop - self.count
+        if begin >= 0:
+            return values[begin:end]
+        initial = np.broadcast_to(self.initial, (min(-begin, end - begin), self.initial.size))
+        return np.concatenate([initial, values[: max(0, end)]])
 
-    def between(self, begin: int, end: int) -> NDArray[np.intp]:
+    def between(self, begin: int, end: int) -> slice:
         """Numbers of the places after one state and up to another."""
-        return np.arange(*np.searchsorted(self.places, [begin, end], side="right"))
+        return slice(*np.searchsorted(self.places, [begin, end], side="right").tolist())
 
 
 def marched_with_lines(
@@ -167,7 +170,7 @@ def marched_with_lines(
     begin = 0
     while begin < nsteps:
         # What returns within a part was taken before it.
-        ends = [line.places[line.between(-1, begin).size + line.count :][:1] for line in lines]
+        ends = [line.places[line.between(-1, begin).stop + line.count :][:1] for line in lines]
         end = min([nsteps, *(int(own[0]) - 1 for own in ends if own.size)])
         if length and begin >= first and end - begin >= length:
             end = begin + (end - begin) // length * length
@@ -205,29 +208,30 @@ def _by_table(
     """
     n, last = found.shape[1], begin + size * count
     own, which = matrices[kinds[begin : begin + size]], [line.between(begin, begin + size) for line in lines]
-    given = forced[begin:last].reshape(count, size, n)
-    columns = np.cumsum(
-        [n, *(some.size * line.given.shape[1] for line, some in zip(lines, which, strict=True))]
-    ).tolist()
-    places = list(zip(lines, values, which, columns[:-1], columns[1:], strict=True))
+    given = forced[begin:last].reshape(count, size, n).transpose(1, 0, 2).copy()
+    sizes = [some.stop - some.start for some in which]
+    columns = np.cumsum([n, *(m * line.given.shape[1] for m, line in zip(sizes, lines, strict=True))]).tolist()
+    places = list(zip(lines, values, which, sizes, columns[:-1], columns[1:], strict=True))
     whole, total = _lifted(own, given, lines, which, columns, begin)
     state, starts = found[begin], np.empty((count, columns[-1]))
-    for part in range(count):
-        starts[part, :n] = state
-        for line, earlier, some, column, end in places:
-            starts[part, column:end] = line.returning(earlier, some + part * some.size).ravel()
-        after = whole @ starts[part] + total[part]
+    for part, start in enumerate(starts):
+        parts = [slice(some.start + part * m, some.stop + part * m) for some, m in zip(which, sizes, strict=True)]
+        start[:n] = state
+        for (line, earlier, *_, column, end), now in zip(places, parts, strict=True):
+            start[column:end] = line.returning(earlier, now).ravel()
+        after = whole @ start + total[part]
         state = after[:n]
-        for _, earlier, some, column, end in places:
-            earlier[some + part * some.size] = after[column:end].reshape(some.size, -1)
-    given = given.copy()
-    for line, _, some, column, end in places:
-        back = starts[:, column:end].reshape(count, some.size, -1, 1)
-        given[:, line.places[some] - 1 - begin] += np.matmul(line.into[some], back)[..., 0]
-    now, inside = starts[:, :n], found[begin + 1 : last + 1].reshape(count, size, n)
-    for j in range(size):
-        now = now @ own[j].T + given[:, j]
-        inside[:, j] = now
+        for (_, earlier, _, m, column, end), now in zip(places, parts, strict=True):
+            earlier[now] = after[column:end].reshape(m, -1)
+    for line, _, some, m, column, end in places:
+        back = starts[:, column:end].reshape(count, m, -1).transpose(1, 2, 0)
+        given[line.places[some] - 1 - begin] += np.matmul(line.into[some], back).transpose(0, 2, 1)
+    states, inside = starts[:, :n], np.empty_like(given)
+    for matrix, add, after in zip(own.transpose(0, 2, 1), given, inside, strict=True):
+        np.matmul(states, matrix, out=after)
+        after += add
+        states = after
+    found[begin + 1 : last + 1].reshape(count, size, n)[:] = inside.transpose(1, 0, 2)
     return last
 
 
@@ -235,7 +239,7 @@ def _lifted(
     matrices: Array,
     given: Array,
     lines: Sequence[DelayLine],
-    which: Sequence[NDArray[np.intp]],
+    which: Sequence[slice],
     columns: Sequence[int],
     begin: int,
 ) -> tuple[Array, Array]:
@@ -243,9 +247,9 @@ def _lifted(
 
     Parameters
     ----------
-    matrices, given : ndarray, shapes (size, n, n) and (count, size, n)
+    matrices, given : ndarray, shapes (size, n, n) and (size, count, n)
         Steps of a part, and what is added after each step of all parts.
-    lines, which : sequences of DelayLine and of ndarray of int
+    lines, which : sequences of DelayLine and of slice
         Lines, and the numbers of their places in the first part.
     columns : sequence of int
         First column of what returns from each line.
@@ -256,21 +260,23 @@ def _lifted(
     -------
     (ndarray, ndarray), shapes (ncolumns, ncolumns) and (count, ncolumns)
     """
-    count, size, n = given.shape
-    known, inner, parts = np.eye(n, columns[-1]), np.zeros((count, n)), np.arange(count)[:, None]
+    count, n = given.shape[1:]
+    known, inner = np.eye(n, columns[-1]), np.zeros((count, n))
     taken, added, due = list[Array](), list[Array](), list[dict[int, int]]()
     for line, some in zip(lines, which, strict=True):
-        taken.append(np.empty((some.size, line.given.shape[1], columns[-1])))
-        added.append(line.given[some + some.size * parts])
+        width, m = line.given.shape[1], some.stop - some.start
+        taken.append(np.empty((m, width, columns[-1])))
+        added.append(line.given[some.start : some.start + m * count].reshape(count, m, width).copy())
         due.append({step: k for k, step in enumerate((line.places[some] - 1 - begin).tolist())})
-    for j in range(size):
-        known, inner = matrices[j] @ known, inner @ matrices[j].T + given[:, j]
+    for j, (matrix, add) in enumerate(zip(matrices, given, strict=True)):
+        known, inner = matrix @ known, inner @ matrix.T
+        inner += add
         now = [(i, steps[j]) for i, steps in enumerate(due) if j in steps]
         for i, k in now:
             width = lines[i].given.shape[1]
-            known[:, columns[i] + k * width : columns[i] + (k + 1) * width] += lines[i].into[which[i][k]]
+            known[:, columns[i] + k * width : columns[i] + (k + 1) * width] += lines[i].into[which[i].start + k]
         for i, k in now:
-            taken[i][k] = lines[i].out @ known
+            np.matmul(lines[i].out, known, out=taken[i][k])
             added[i][:, k] += inner @ lines[i].out.T
     whole = np.concatenate([known, *(rows.reshape(-1, columns[-1]) for rows in taken)])
     return whole, np.concatenate([inner, *(rows.reshape(count, -1) for rows in added)], axis=1)

@@ -74,7 +74,8 @@ def _run_sampled(job: Job, form: SampledForm) -> Record:
         times = np.union1d(times, motion.instants.times)
 
     def snapshot(t: Array, x: Array) -> Snapshot:
-        z, w = np.concatenate([x, motion.registers_at(t)]), signal_values(time_signals, t)
+        registers = known[n:] if t is times else motion.registers_at(t)
+        z, w = np.concatenate([x, registers]), signal_values(time_signals, t)
 
         def signals() -> Array:
             return np.asarray(form.signals_z @ z + form.signals_w @ w)
@@ -84,7 +85,7 @@ def _run_sampled(job: Job, form: SampledForm) -> Record:
     def interpolate(k: int, t: float) -> Array:
         return motion.at(np.array([t]))[:n, 0]
 
-    z = motion.at(times)
+    known = z = motion.at(times)
     if motion.growth > _GROWTH:
         nearly = moved_signals(form.perturbed(2.0**-50), given, job.first, last, job.state)[1].at(times)
         w = signal_values(time_signals, times)
