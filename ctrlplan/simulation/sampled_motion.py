@@ -8,7 +8,7 @@ parts. Whatever the position of a breakpoint, each side is read where it is vali
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -367,19 +367,19 @@ class SampledMotion:
 
     def _by_series(self, which: NDArray[np.intp], since: Array) -> Array:
         """States of the flow (ntime, nx) in whole intervals, times [s] after their starts."""
-        found = np.empty((since.size, self.form.moving.size))
-        kinds = self._spans.kinds[which]
-        for kind in np.flatnonzero(np.bincount(kinds)).tolist():
-            own = np.flatnonzero(kinds == kind)
-            place = since[own] * (self.cells(kind) / self._spans.different[kind])
-            cell = np.minimum(place.astype(np.intp), self.cells(kind) - 1)
-            for k in np.flatnonzero(np.bincount(cell)).tolist():
-                some = cell == k
-                inside = which[own[some]]
-                new = np.append(True, inside[1:] != inside[:-1])
-                series = self.series(inside[new], kind, k)
-                found[own[some]] = _evaluated(series, np.cumsum(new) - 1, 2.0 * (place[some] - k) - 1.0)
-        return found
+
+        def of_one_kind(kind: int, own: NDArray[np.intp] | slice) -> Array:
+            cells = self.cells(kind)
+            place, inside = since[own] * (cells / self._spans.different[kind]), which[own]
+            cell = np.minimum(place.astype(np.intp), cells - 1) if cells > 1 else None
+            return _part_by_part(cell, place.size, lambda k, some: in_cell(kind, k, inside[some], place[some] - k))
+
+        def in_cell(kind: int, cell: int, inside: NDArray[np.intp], place: Array) -> Array:
+            new = np.append(True, inside[1:] != inside[:-1])
+            return _evaluated(self.series(inside[new], kind, cell), np.cumsum(new) - 1, 2.0 * place - 1.0)
+
+        kinds = self._spans.kinds[which] if self._spans.different.size > 1 else None
+        return _part_by_part(kinds, since.size, of_one_kind)
 
     def _by_nodes(self, which: NDArray[np.intp], since: Array) -> Array:
         """The same in any spans, from values of the functions of time between their starts and each time."""
@@ -607,6 +607,21 @@ def _tail(values: Array, order: int) -> float:
 def _largest(values: Array) -> Array:
     """Largest magnitudes of columns."""
     return np.maximum(values.max(axis=0, initial=0.0), -values.min(axis=0, initial=0.0))
+
+
+def _part_by_part(
+    parts: NDArray[np.intp] | None, count: int, rows: Callable[[int, NDArray[np.intp] | slice], Array]
+) -> Array:
+    """Rows (count, nx) of a function of a part and of the indices of its rows; None for one part 0."""
+    present = [0] if parts is None else np.flatnonzero(np.bincount(parts)).tolist()
+    if len(present) == 1:
+        return rows(present[0], slice(None))
+    places = [np.flatnonzero(parts == part) for part in present]
+    values = [rows(part, own) for part, own in zip(present, places, strict=True)]
+    found = np.empty((count, values[0].shape[1]))
+    for own, some in zip(places, values, strict=True):
+        found[own] = some
+    return found
 
 
 def _evaluated(series: Array, row: NDArray[np.intp], x: Array) -> Array:
