@@ -3,6 +3,7 @@
 import gc
 import os
 import sys
+import zlib
 
 import pytest
 import repetitions
@@ -23,24 +24,48 @@ def pytest_configure(config):
     repetitions.load(everyday(config))
 
 
+def pytest_addoption(parser):
+    parser.addoption(
+        "--all-combinations",
+        action="store_true",
+        help="of tests with several lists of cases, run every combination, and not a quarter of the redundant ones",
+    )
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m selects
-def pytest_collection_modifyitems(items):
-    """Of all combinations of several lists of cases, those not needed to have each case of each list once are slow."""
+def pytest_collection_modifyitems(config, items):
+    """Of all combinations of several lists of cases, those not needed to have each case of each list once are slow,
+    and a quarter of them is run.
+    """
     families = {}
     for item in items:
-        if len(lists := list(item.iter_markers("parametrize"))) > 1 and not item.get_closest_marker("slow"):
+        if len(lists := list(item.iter_markers("parametrize"))) > 1:
             values = {(names, _case(item, names)) for names in map(_names, lists)}
             families.setdefault(item.nodeid.partition("[")[0], []).append((item, values))
+    left_out = set()
     for cases in families.values():
         known, chosen = set(), set()
-        for enough in (set.isdisjoint, lambda values, known: not values <= known):  # all values new, then any of them
-            for item, values in cases:
-                if enough(values, known):
-                    known |= values
-                    chosen.add(item)
+        _choose([case for case in cases if not case[0].get_closest_marker("slow")], known, chosen)
+        everyday = set(chosen)
+        _choose(cases, known, chosen)
         for item, _ in cases:
-            if item not in chosen:
+            if item not in everyday and not item.get_closest_marker("slow"):
                 item.add_marker("slow")
+            # By its name: the same in each process, and whichever files are run.
+            if item not in chosen and zlib.crc32(item.nodeid.encode()) % 4:
+                left_out.add(item)
+    if left_out and not config.getoption("all_combinations", False):
+        config.hook.pytest_deselected(items=list(left_out))
+        items[:] = [item for item in items if item not in left_out]
+
+
+def _choose(cases, known, chosen):
+    """Add to the chosen tests until all values of these cases are known."""
+    for enough in (set.isdisjoint, lambda values, known: not values <= known):  # all values new, then any of them
+        for item, values in cases:
+            if item not in chosen and enough(values, known):
+                known |= values
+                chosen.add(item)
 
 
 def _names(mark):
