@@ -28,7 +28,7 @@ def pytest_addoption(parser):
     parser.addoption(
         "--all-combinations",
         action="store_true",
-        help="of tests with several lists of cases, run every combination, and not a quarter of the redundant ones",
+        help="run all combinations of lists of cases; without it, a quarter of those in which no case is new",
     )
 
 
@@ -51,8 +51,8 @@ def pytest_collection_modifyitems(config, items):
         for item, _ in cases:
             if item not in everyday and not item.get_closest_marker("slow"):
                 item.add_marker("slow")
-            # By its name: the same in each process, and whichever files are run.
-            if item not in chosen and zlib.crc32(item.nodeid.encode()) % 4:
+            redundant = item not in chosen and not item.get_closest_marker("every_combination")
+            if redundant and zlib.crc32(item.nodeid.encode()) % 4:  # the same in each process, whichever files are run
                 left_out.add(item)
     if left_out and not config.getoption("all_combinations", False):
         config.hook.pytest_deselected(items=list(left_out))
@@ -98,9 +98,9 @@ def pytest_runtest_teardown():
 
 
 @pytest.fixture
-def blank_drawings(monkeypatch, pytestconfig):
-    """Pages of the everyday run with blank drawings, for tests of what is around them; the whole suite draws them."""
-    if everyday(pytestconfig):
+def blank_drawings(monkeypatch, request):
+    """Pages of everyday tests with blank drawings, for tests of what is around them; slow tests draw them."""
+    if not request.node.get_closest_marker("slow"):
         monkeypatch.setattr("ctrlplan.reports.shown.to_svg", lambda figure, key: "<svg></svg>")
 
 
