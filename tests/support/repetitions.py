@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import settings
 
-settings.register_profile("whole", deadline=None, derandomize=True, print_blob=True, max_examples=40)
+settings.register_profile("whole", deadline=None, derandomize=True, print_blob=True, max_examples=30)
 settings.register_profile("everyday", settings.get_profile("whole"), max_examples=15)
 
 
