@@ -98,10 +98,16 @@ def pytest_runtest_teardown():
 
 
 @pytest.fixture
-def blank_drawings(monkeypatch, request):
-    """Pages of everyday tests with blank drawings, for tests of what is around them; slow tests draw them."""
+def blank_drawings(monkeypatch):
+    """Pages with blank drawings, for tests of what is around them."""
+    monkeypatch.setattr("ctrlplan.reports.shown.to_svg", lambda figure, key: "<svg></svg>")
+
+
+@pytest.fixture
+def drawn_if_slow(request):
+    """Pages with blank drawings in everyday tests only: what differs from case to case is drawn in the slow ones."""
     if not request.node.get_closest_marker("slow"):
-        monkeypatch.setattr("ctrlplan.reports.shown.to_svg", lambda figure, key: "<svg></svg>")
+        request.getfixturevalue("blank_drawings")
 
 
 @pytest.hookimpl(optionalhook=True)

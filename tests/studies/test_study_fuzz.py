@@ -209,7 +209,7 @@ class Tags(HTMLParser):
         self.handlers += [key for key, _ in attrs if key.startswith("on")]
 
 
-@pytest.mark.usefixtures("blank_drawings")
+@pytest.mark.usefixtures("drawn_if_slow")
 # What is promised at the end of all numbers is an answer: that it overflows there is no fault.
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.slow
