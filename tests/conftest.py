@@ -3,6 +3,7 @@
 import gc
 import os
 import sys
+import zlib
 
 import pytest
 import repetitions
@@ -27,24 +28,48 @@ def pytest_configure(config):
     repetitions.load(everyday(config))
 
 
+def pytest_addoption(parser):
+    parser.addoption(
+        "--all-combinations",
+        action="store_true",
+        help="run all combinations of lists of cases; without it, a quarter of those in which no case is new",
+    )
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m selects
-def pytest_collection_modifyitems(items):
-    """Of all combinations of several lists of cases, those not needed to have each case of each list once are slow."""
+def pytest_collection_modifyitems(config, items):
+    """Of all combinations of several lists of cases, those not needed to have each case of each list once are slow,
+    and a quarter of them is run.
+    """
     families = {}
     for item in items:
-        if len(lists := list(item.iter_markers("parametrize"))) > 1 and not item.get_closest_marker("slow"):
+        if len(lists := list(item.iter_markers("parametrize"))) > 1:
             values = {(names, _case(item, names)) for names in map(_names, lists)}
             families.setdefault(item.nodeid.partition("[")[0], []).append((item, values))
+    left_out = set()
     for cases in families.values():
         known, chosen = set(), set()
-        for enough in (set.isdisjoint, lambda values, known: not values <= known):  # all values new, then any of them
-            for item, values in cases:
-                if enough(values, known):
-                    known |= values
-                    chosen.add(item)
+        _choose([case for case in cases if not case[0].get_closest_marker("slow")], known, chosen)
+        everyday = set(chosen)
+        _choose(cases, known, chosen)
         for item, _ in cases:
-            if item not in chosen:
+            if item not in everyday and not item.get_closest_marker("slow"):
                 item.add_marker("slow")
+            redundant = item not in chosen and not item.get_closest_marker("every_combination")
+            if redundant and zlib.crc32(item.nodeid.encode()) % 4:  # the same in each process, whichever files are run
+                left_out.add(item)
+    if left_out and not config.getoption("all_combinations", False):
+        config.hook.pytest_deselected(items=list(left_out))
+        items[:] = [item for item in items if item not in left_out]
+
+
+def _choose(cases, known, chosen):
+    """Add to the chosen tests until all values of these cases are known."""
+    for enough in (set.isdisjoint, lambda values, known: not values <= known):  # all values new, then any of them
+        for item, values in cases:
+            if item not in chosen and enough(values, known):
+                known |= values
+                chosen.add(item)
 
 
 def _names(mark):
@@ -77,10 +102,16 @@ def pytest_runtest_teardown():
 
 
 @pytest.fixture
-def blank_drawings(monkeypatch, pytestconfig):
-    """Pages of the everyday run with blank drawings, for tests of what is around them; the whole suite draws them."""
-    if everyday(pytestconfig):
-        monkeypatch.setattr("ctrlplan.reports.shown.to_svg", lambda figure, key: "<svg></svg>")
+def blank_drawings(monkeypatch):
+    """Pages with blank drawings, for tests of what is around them."""
+    monkeypatch.setattr("ctrlplan.reports.shown.to_svg", lambda figure, key: "<svg></svg>")
+
+
+@pytest.fixture
+def drawn_if_slow(request):
+    """Pages with blank drawings in everyday tests only: what differs from case to case is drawn in the slow ones."""
+    if not request.node.get_closest_marker("slow"):
+        request.getfixturevalue("blank_drawings")
 
 
 @pytest.hookimpl(optionalhook=True)

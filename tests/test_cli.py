@@ -275,7 +275,7 @@ ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("more", [{"PYTHONIOENCODING": "ascii"}, {"PYTHONIOENCODING": "ascii:strict"}, {}])
+@pytest.mark.parametrize("more", [{"PYTHONIOENCODING": "ascii:strict"}, {}])
 def test_a_terminal_without_the_letters_of_a_path_gets_it_all_the_same(more, tmp_path):
     (tmp_path / "üb🚀er.toml").write_text(STUDY, encoding="utf-8")
     environment = {**os.environ, **ASCII, **more}
@@ -413,13 +413,18 @@ def test_without_room_for_the_page_nothing_is_left(study, tmp_path):
     resource = pytest.importorskip("resource", reason="there are no limits of the size of files here")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "results.json").write_text("before")
-    for out in ("out", "new/folder"):
-        done = python_m(
-            *("report", study, "--out", tmp_path / out),
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
-        )
-        assert done.returncode == 2
-        assert done.stderr.splitlines()[-1].startswith("ctrlplan: --out must be writable, got")
+    code = "import sys; from ctrlplan.cli import main; sys.exit(sum(main([*sys.argv[1:4], o]) for o in sys.argv[4:]))"
+    arguments = ["report", study, "--out", tmp_path / "out", tmp_path / "new/folder"]
+    done = subprocess.run(
+        [sys.executable, *WARNINGS, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
+    )
+    assert done.returncode == 2 + 2, done.stderr
+    ends = [line for line in done.stderr.splitlines() if line.startswith("ctrlplan: --out must be writable, got")]
+    assert len(ends) == 2
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "wall.toml"]
     assert [(p.name, p.read_text()) for p in (tmp_path / "out").iterdir()] == [("results.json", "before")]
 

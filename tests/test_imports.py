@@ -2,6 +2,7 @@
 
 import ast
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,14 +24,21 @@ SHOWING = {"plot", "report", "_repr_html_"}
 """Methods that only show, which may import reports."""
 
 
+@cache
+def nodes(tree):
+    """All nodes of a module."""
+    return tuple(ast.walk(tree))
+
+
 def is_private(name):
     return name.startswith("_") and not name.startswith("__") and name not in PROTOCOLS
 
 
+@cache  # what many modules inherit from
 def defined(tree):
     """Names that a module defines: functions, classes, variables, and attributes that its objects are given."""
     found = set()
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             found.add(node.name)
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
@@ -49,17 +57,18 @@ def is_own(node):
     return isinstance(node, ast.Name) and node.id in ("self", "cls", "super")
 
 
+@cache
 def inherited(tree):
     """Names that the modules of base classes define: what a class does with objects of its own kind."""
     homes = {
         alias.asname or alias.name: node.module
-        for node in ast.walk(tree)
+        for node in nodes(tree)
         if isinstance(node, ast.ImportFrom) and node.module
         for alias in node.names
     }
     bases = {
         base.id
-        for node in ast.walk(tree)
+        for node in nodes(tree)
         if isinstance(node, ast.ClassDef)
         for base in node.bases
         if isinstance(base, ast.Name) and base.id in homes
@@ -77,7 +86,7 @@ def test_no_private_name_of_another_module_is_imported(file):
     modules = {path.removesuffix(".py").rpartition("/")[2] for path in TREES} | {"_pieces"}
     wrong = [
         f"{node.module}.{alias.name}, line {node.lineno}"
-        for node in ast.walk(TREES[file])
+        for node in nodes(TREES[file])
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
         if is_private(alias.name) and alias.name not in modules
@@ -91,7 +100,7 @@ def test_no_private_attribute_of_another_modules_object_is_used(file):
     own = defined(tree) | inherited(tree)
     wrong = [
         f"{ast.unparse(node)}, line {node.lineno}"
-        for node in ast.walk(tree)
+        for node in nodes(tree)
         if isinstance(node, ast.Attribute)
         and is_private(node.attr)
         and not is_own(node.value)

@@ -11,7 +11,7 @@ pytest.importorskip("nbclient")
 import nbformat
 from words import in_text
 
-from notebooks import FOLDER, Tolerance, code_cells, differences, executed, same_texts, stored_form, texts
+from notebooks import FOLDER, Tolerance, code_cells, differences, executed, kernel, same_texts, stored_form, texts
 
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LONGEST = 12  # lines of code a cell: more is a module that has not been written yet
@@ -138,9 +138,16 @@ def test_programs_from_equations_to_report_are_short(name, heading, most):
 # That it runs
 
 
+@pytest.fixture(scope="module")
+def client():
+    """One kernel for all notebooks: half of the time of one would be that of its imports."""
+    with kernel() as client:
+        yield client
+
+
 @pytest.mark.slow
-def test_a_new_run_gives_the_same_outputs(notebook, path):
-    assert differences(notebook, executed(path)) == []
+def test_a_new_run_gives_the_same_outputs(notebook, path, client):
+    assert differences(notebook, executed(path, client)) == []
 
 
 # How outputs are compared

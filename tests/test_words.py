@@ -11,6 +11,8 @@ import words
 
 import ctrlplan as cp
 
+pytestmark = pytest.mark.every_combination
+
 PACKAGE = Path(cp.__file__).parent
 SHORT = ("trajectories", "planning", "metrics", "flatness", "symbolic")
 """Folders whose public summaries have at most 64 characters."""

@@ -8,6 +8,8 @@ import pytest
 
 from ctrlplan import metrics
 
+pytestmark = pytest.mark.every_combination
+
 NAMES = sorted(metrics.__all__)
 SIGNALS = ("y", "error", "u", "signal", "path", "jerk")
 TIMES = np.array([0.0, 0.5, 1.5, 2.0, 3.0, 4.5, 5.0])

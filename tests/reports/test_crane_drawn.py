@@ -2,8 +2,6 @@
 
 import json
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,9 +9,9 @@ import numpy as np
 import pytest
 from drawings import drawn_texts
 from repetitions import one_in
-from strict import WARNINGS
 
 import ctrlplan as cp
+from ctrlplan.cli import main
 from ctrlplan.reports import CraneAnimation, draw, render_page
 from ctrlplan.reports.crane_figures import animation_data, plot_motion, plot_paths, plot_step, plot_time
 from ctrlplan.studies import Study, sections
@@ -308,12 +306,11 @@ def crane_file(folder, places, loop="", order="xz", end=60.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("inner", [0, 3, 5])
-def test_a_crane_study_file_may_have_any_number_of_waypoints(inner, tmp_path):
+def test_a_crane_study_file_may_have_any_number_of_waypoints(inner, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     places = [(2.0 * i, 10.0 - 0.3 * i) for i in range(inner + 2)]
     path = crane_file(tmp_path, places, "drum_radius = 1.5")
-    command = [sys.executable, *WARNINGS, "-m", "ctrlplan", "report", path.name, "--out", "out"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert main(["report", path.name, "--out", "out"]) == 0, capsys.readouterr().err
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert '"b": 1.5' in page
     names = ["start", *"ABCDE"[:inner], "goal"]

@@ -95,10 +95,19 @@ def test_no_element_and_no_attribute_comes_from_a_text(name, undrawn, plain, rea
     assert next(tree.all("title")).words() == seen(TEXTS[name])
 
 
+@cache
+def drawn_page(offset):
+    """A page with all figures, and another text of the list in each place."""
+    return render_page([study(mixed(offset))], "page")
+
+
+OFFSETS = pytest.mark.parametrize("offset", range(0, len(TEXTS), 15))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("offset", range(0, len(TEXTS), 11))
+@OFFSETS
 def test_nor_where_figures_are_drawn(offset, plain, read):
-    tree = read(render_page([study(mixed(offset))], "page"))
+    tree = read(drawn_page(offset))
     assert structure(tree) == plain(True)
     for element in tree.all():
         assert not [key for key in element.attributes if key.startswith("on")]
@@ -267,9 +276,9 @@ return {
 
 @pytest.fixture
 def opened(browser, tmp_path):
-    def at(*studies):
+    def at(page):
         path = tmp_path / "index.html"
-        path.write_text(render_page(studies, "page"), encoding="utf-8")
+        path.write_text(page, encoding="utf-8")
         browser.get("about:blank")
         browser.get_log("browser")
         browser.get(path.as_uri())
@@ -297,8 +306,8 @@ def check(chrome):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TEXTS)
-def test_a_browser_runs_nothing_that_a_text_says(name, opened):
-    found = check(opened(study(lambda role: f"{TEXTS[name]} {role}", drawn=False)))
+def test_a_browser_runs_nothing_that_a_text_says(name, undrawn, opened):
+    found = check(opened(render_page([study(lambda role: f"{TEXTS[name]} {role}", drawn=False)], "page")))
     text = " ".join(found["text"].split())
     assert seen(f"{TEXTS[name]} reason") in text
     assert [" ".join(plan.split()) for plan in found["plans"]] == [
@@ -308,9 +317,9 @@ def test_a_browser_runs_nothing_that_a_text_says(name, opened):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("offset", range(0, len(TEXTS), 15))
+@OFFSETS
 def test_nor_where_it_stands_in_a_figure(offset, opened):
-    check(opened(study(mixed(offset))))
+    check(opened(drawn_page(offset)))
 
 
 @pytest.mark.slow

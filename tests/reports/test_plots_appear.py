@@ -297,6 +297,7 @@ def test_the_error_names_what_each_axes_shows():
         compared().plot(axes)
 
 
+@pytest.mark.every_combination
 @pytest.mark.parametrize(
     ("given", "got"),
     [

@@ -253,10 +253,10 @@ def test_positions_that_depend_on_the_sine_of_a_huge_angle(scale):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "start", "duration"), [("compiled", 0.0, 100.0), ("python", 0.0, 10.0), ("python", 1e4, 10.0)]
+    ("method", "start", "duration"), [("compiled", 0.0, 50.0), ("python", 0.0, 2.5), ("python", 1e4, 2.5)]
 )
 def test_many_turns_with_a_rippling_rate(method, start, duration):
-    """As far as 2500 rad in 16,000 periods of a ripple."""
+    """As far as 1250 rad in 8,000 periods of a ripple."""
     errors, found = rough_turns(1.0, method, start, 25.0, 1000.0, duration)
     assert errors.max() < 1e-7 or "depend on small fractions of large states" in found.reason
     assert errors.max() < ALLOWED

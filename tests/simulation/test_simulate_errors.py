@@ -8,6 +8,8 @@ import pytest
 
 import ctrlplan as cp
 
+pytestmark = pytest.mark.every_combination
+
 T = np.linspace(0.0, 2.0, 11)
 PLAN = cp.PolySpline([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)], labels=["r"])
 LOOP = cp.plants.integrator_lag_loop(5.0)

@@ -154,7 +154,7 @@ def test_a_scalar_initial_state_is_for_all_states():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["compiled", "python"])
-@pytest.mark.parametrize("count", [301, pytest.param(1501, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [301, 601])
 def test_many_samples_next_to_a_plan_that_comes_to_rest(count, method):
     """Near zero velocity the derivatives of a plan are rounding errors: no segment is halved for them without end."""
     t = np.linspace(0.0, 6.0, count)

@@ -12,6 +12,8 @@ from scipy.special import erf, expit
 import ctrlplan as cp
 from ctrlplan.simulation.network import Block
 
+pytestmark = pytest.mark.every_combination
+
 ca = pytest.importorskip("casadi")
 symbols = pytest.importorskip("ctrlplan.symbolic.symbols")
 

@@ -15,7 +15,6 @@ from ctrlplan.reports import verdicts
 from ctrlplan.studies.choosing import (
     clearance_note,
     fastest_notes,
-    nominal_benefit,
     nominal_fastest,
     optimality_claim,
     optimality_grids,
@@ -297,18 +296,13 @@ def test_clearance_is_that_of_dense_samples():
 # The nominal move compared its baselines
 
 
-@pytest.fixture(scope="module")
-def compared():
-    return nominal_benefit()
-
-
 @pytest.mark.slow
-def test_the_nominal_move_beside_its_baselines(compared):
+def test_the_nominal_move_beside_its_baselines(baselines):
     names = ["trigonometric", "step", "trapezoid", "S-curve", "shaped step", "shaped S-curve", "quintic (minimum jerk)"]
-    assert list(compared.comparison.plans) == [*names, "septic", "nonic"]
+    assert list(baselines.comparison.plans) == [*names, "septic", "nonic"]
     half = np.pi * np.sqrt(10.5 / G)
-    np.testing.assert_allclose(compared.comparison.plans["shaped step"].breakpoints, [0, half, 2 * half], rtol=1e-12)
-    required = {one.name: one for one in compared.required_durations}
+    np.testing.assert_allclose(baselines.comparison.plans["shaped step"].breakpoints, [0, half, 2 * half], rtol=1e-12)
+    required = {one.name: one for one in baselines.required_durations}
     # 15/8 of 20 m in 15 s is the limit of 2.5 m/s itself.
     assert required["quintic (minimum jerk)"].duration == pytest.approx(15.0, rel=1e-9)
     t = np.linspace(0, 1, 100_001)
@@ -318,10 +312,10 @@ def test_the_nominal_move_beside_its_baselines(compared):
 
 
 @pytest.mark.slow
-def test_the_s_curve_of_the_needs_sways_as_far_as_is_allowed(compared):
+def test_the_s_curve_of_the_needs_sways_as_far_as_is_allowed(baselines):
     """A jerk limit of 0.4 alone would take 20/2.5 + 2.5/0.6 + 0.6/0.4 s: it is retimed to 0.06 rad of sway."""
     alone = 20 / 2.5 + 2.5 / 0.6 + 0.6 / 0.4
-    (one,) = (one for one in compared.required_durations if one.name == "S-curve")
+    (one,) = (one for one in baselines.required_durations if one.name == "S-curve")
     stretch = one.duration / alone
     across, fall = 0.6 / stretch**2, 0.03 / stretch**2
     assert np.arctan2(across, G - fall) == pytest.approx(0.06, rel=1e-6)
@@ -329,11 +323,11 @@ def test_the_s_curve_of_the_needs_sways_as_far_as_is_allowed(compared):
 
 
 @pytest.mark.slow
-def test_values_of_the_crane_are_those_of_runs_of_their_own(compared):
-    settling, sway, force = compared.grids
-    assert [grid.unit for grid in compared.grids] == ["s", "rad", "N"]
+def test_values_of_the_crane_are_those_of_runs_of_their_own(baselines):
+    settling, sway, force = baselines.grids
+    assert [grid.unit for grid in baselines.grids] == ["s", "rad", "N"]
     plan = cp.TrigSpline(nominal_waypoints(), alpha=3.0)
-    profile = compared.comparison.plans["S-curve"]
+    profile = baselines.comparison.plans["S-curve"]
     t = np.linspace(0, 40, 4001)
     limits = {"force_limits": (-30e3, 30e3), "torque_limits": (-3e3, 1e3)}
     for given, law, column in ((plan, "generator", None), (profile, "generator", "S-curve")):
@@ -347,15 +341,15 @@ def test_values_of_the_crane_are_those_of_runs_of_their_own(compared):
 
 
 @pytest.mark.slow
-def test_what_jumps_takes_no_path_and_the_others_the_straight_line(compared):
-    lengths = {name: values["path_length"] for name, values in compared.comparison.metrics.items()}
+def test_what_jumps_takes_no_path_and_the_others_the_straight_line(baselines):
+    lengths = {name: values["path_length"] for name, values in baselines.comparison.metrics.items()}
     for name, found in lengths.items():
         assert found == pytest.approx(np.nan if "step" in name else 401**0.5, rel=1e-6, nan_ok=True), name
 
 
 @pytest.mark.slow
-def test_limited_drives_are_never_asked_for_more_than_they_have(compared):
-    force = compared.grids[2]
+def test_limited_drives_are_never_asked_for_more_than_they_have(baselines):
+    force = baselines.grids[2]
     peaks = [np.nanmax(rows) for rows in force.baselines.values() if not np.isnan(rows).all()]
     assert max(force.values.max(), *peaks) <= 30e3 * (1 + 1e-9)
 
@@ -373,12 +367,12 @@ def test_the_time_of_the_slack_rope_is_the_integration_by_hand():
 
 
 @pytest.mark.slow
-def test_every_smooth_baseline_goes_through_the_flat_map(compared):
+def test_every_smooth_baseline_goes_through_the_flat_map(baselines):
     """Residual sway and force of septic, nonic and alpha = 3 through the same generator."""
-    rows = compared.comparison.metrics
+    rows = baselines.comparison.metrics
     for name in ("septic", "nonic"):
         assert (rows[name]["sway_after"], rows[name]["force_peak"]) == pytest.approx(SMOOTH[name], rel=1e-3)
-    sway, force = compared.grids[1:]
+    sway, force = baselines.grids[1:]
     assert (sway.values[1, 3], force.values[1, 3]) == pytest.approx(SMOOTH["alpha = 3"], rel=5e-3)
     assert {row[3] for row in sway.marks()} == {"worse"}  # alpha = 3 is not the best in sway at any duration
     s = np.linspace(0, 1, 101)
@@ -386,14 +380,15 @@ def test_every_smooth_baseline_goes_through_the_flat_map(compared):
         ("septic", s**4 * (35 - 84 * s + 70 * s**2 - 20 * s**3)),
         ("nonic", s**5 * (126 - 420 * s + 540 * s**2 - 315 * s**3 + 70 * s**4)),
     ):
-        np.testing.assert_allclose(compared.comparison.plans[name](15 * s), [20 * curve, 10 + curve], rtol=0, atol=1e-9)
+        plan = baselines.comparison.plans[name]
+        np.testing.assert_allclose(plan(15 * s), [20 * curve, 10 + curve], rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow
-def test_a_step_is_valid_up_to_the_slack_rope_and_is_not_ranked(compared):
-    found = compared.comparison
+def test_a_step_is_valid_up_to_the_slack_rope_and_is_not_ranked(baselines):
+    found = baselines.comparison
     assert found.stopped["step"] == pytest.approx(SLACK, abs=1e-3)
     assert str(SLACK) in found.marks["step"]
     assert found.responses["step"].time[-1] == found.stopped["step"]
     assert not any("step" in (*verdict.best, *verdict.worst) for verdict in verdicts(found))
-    assert all(np.isnan(grid.baselines["step"]).all() for grid in compared.grids)
+    assert all(np.isnan(grid.baselines["step"]).all() for grid in baselines.grids)

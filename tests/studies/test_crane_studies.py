@@ -98,7 +98,8 @@ def test_time_with_a_slack_rope_is_measured_and_marked():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["nominal", "first_order", "obstacle"])
-def test_studies_run_whole(name):
+def test_studies_run_whole(name, baselines, monkeypatch):
+    monkeypatch.setattr(studies, "nominal_benefit", lambda: baselines)
     study = getattr(studies, f"crane_{name}_study")(progress=False)
     found = study.comparison
     assert {"step", "polynomial", "trigonometric", "piecewise"} <= found.metrics.keys()

@@ -32,7 +32,7 @@ def failing(error, low, high, nominal):
 
 @pytest.mark.slow
 def test_other_processes_find_the_same_bits(found):
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         same_bits(found, run(lag(), LAGS, pool))
 
 

@@ -209,11 +209,11 @@ class Tags(HTMLParser):
         self.handlers += [key for key, _ in attrs if key.startswith("on")]
 
 
-@pytest.mark.usefixtures("blank_drawings")
+@pytest.mark.usefixtures("drawn_if_slow")
 # What is promised at the end of all numbers is an answer: that it overflows there is no fault.
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.slow
-@examples(25)
+@examples(20)
 @given(named_by_others())
 def test_the_report_is_a_page_without_foreign_elements_or_status_2_and_nothing(data):
     with TemporaryDirectory() as folder, redirect_stderr(io.StringIO()) as said, redirect_stdout(io.StringIO()):

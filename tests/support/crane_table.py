@@ -6,6 +6,7 @@ integrated by LSODA with a relative tolerance of 1e-10: no line of the package
 is in it. The crane starts at rest at the first waypoint, D = x - b, R = z.
 """
 
+import cmath
 import math
 
 import numpy as np
@@ -97,17 +98,29 @@ def _one_axis(exact):
     c = [float(value) for value in exact.coefficients]
     rate = float(exact.rate)
     if not exact.alpha:
-        curves = [np.polynomial.Polynomial(c).deriv(nu) for nu in range(3)]
-        return lambda t, nu: rate**nu * curves[nu](rate * t)
+        # About the middle of the move, where its powers are small: an integrator follows errors of rounding too.
+        middle = [
+            sum(v * math.comb(k, j) / 2 ** (k - j) for k, v in enumerate(exact.coefficients) if k >= j)
+            for j in range(len(c))
+        ]
+        shape = np.polynomial.Polynomial([float(value) for value in middle])
+        powers = [(rate**nu * shape.deriv(nu).coef[::-1]).tolist() for nu in range(3)]
+        return lambda t, nu: _horner(powers[nu], rate * t - 0.5)
     pairs = len(c) // 2 if len(c) % 2 else exact.m - 1
     waves = [(k, c[2 * k - 1] - 1j * c[2 * k]) for k in range(1, pairs + 1)]
     if len(c) % 2 == 0:
         waves.append((exact.m, -1j * c[-1] * np.exp(-1j * exact.m * float(exact.gamma))))
-    number = np.array([k for k, _ in waves])
-    weight = np.array([w for _, w in waves])
+    turning = [[(w * (1j * k * rate) ** nu, 1j * k * rate) for k, w in waves] for nu in range(3)]
     return lambda t, nu: (
-        (c[0] if nu == 0 else 0.0) + np.real((weight * (1j * number * rate) ** nu) @ np.exp(1j * number * rate * t))
+        (c[0] if nu == 0 else 0.0) + sum((weight * cmath.exp(turn * t)).real for weight, turn in turning[nu])
     )
+
+
+def _horner(powers, s):
+    value = 0.0
+    for power in powers:
+        value = value * s + power
+    return value
 
 
 def smooth_step(*coefficients):

@@ -13,6 +13,7 @@ import html
 import re
 import sys
 import tempfile
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,17 @@ FOLDER = Path(__file__).parents[2] / "notebooks"
 LANGUAGE = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"}}
 STATED = {"digits": 4, "zero": 1e-9}
 TIMEOUT = 120  # s a cell
+
+EMPTY = """\
+__import__("os").chdir({folder!r})  # first: that of the notebook before is gone
+%reset -f
+import warnings
+import matplotlib
+matplotlib.rc_file_defaults()
+warnings.filterwarnings("default", append=True)  # whatever a notebook before has shown is shown again
+del warnings, matplotlib
+"""
+"""What leaves a kernel as a new one is, but for the modules that it has imported."""
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE)
@@ -47,14 +59,25 @@ class Tolerance:
         return largest <= self.zero or abs(a - b) <= 0.5 * 10.0 ** (1 - self.digits) * largest
 
 
-def executed(path):
-    """Run a notebook in a kernel and a folder of its own; returned with its new outputs."""
+@contextmanager
+def kernel():
+    """Kernel for one or several notebooks, as the client that runs it."""
+    client = nbclient.NotebookClient(
+        nbformat.v4.new_notebook(), timeout=TIMEOUT, kernel_name="python3", record_timing=False
+    )
+    with client.setup_kernel():
+        yield client
+
+
+def executed(path, client):
+    """Run a notebook in a kernel, from an empty namespace and in a folder of its own; returned with its new outputs."""
     notebook = nbformat.read(path, as_version=4)
     with tempfile.TemporaryDirectory() as folder:
-        resources = {"metadata": {"path": folder}}
-        nbclient.NotebookClient(
-            notebook, timeout=TIMEOUT, kernel_name="python3", resources=resources, record_timing=False
-        ).execute()
+        client.nb = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(EMPTY.format(folder=folder))])
+        client.execute_cell(client.nb.cells[0], 0)
+        client.nb = notebook
+        for index, cell in enumerate(notebook.cells):
+            client.execute_cell(cell, index)
     for cell in code_cells(notebook):
         cell.outputs = joined(cell.outputs)
     return notebook
@@ -137,7 +160,8 @@ def main(names):
     """Renew notebooks by the beginnings of their names; all without one."""
     for path in sorted(FOLDER.glob("*.ipynb")):
         if not names or path.name.startswith(tuple(names)):
-            nbformat.write(stored_form(executed(path)), path)
+            with kernel() as client:
+                nbformat.write(stored_form(executed(path, client)), path)
             print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB")
 
 

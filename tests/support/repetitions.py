@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import settings
 
-settings.register_profile("whole", deadline=None, derandomize=True, print_blob=True, max_examples=100)
+settings.register_profile("whole", deadline=None, derandomize=True, print_blob=True, max_examples=30)
 settings.register_profile("everyday", settings.get_profile("whole"), max_examples=15)
 
 
@@ -13,7 +13,7 @@ def load(everyday):
 
 
 def examples(number):
-    """Settings of a test with so many examples in the whole suite, and in the everyday run a seventh, at least 5."""
+    """Settings of a test with a share of so many examples: as in the profile, of 100, at least 5."""
     return settings(max_examples=min(number, max(5, number * settings.default.max_examples // 100)))
 
 

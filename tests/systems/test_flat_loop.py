@@ -303,7 +303,7 @@ def test_riccati_law_costs_no_more_than_gains_scheduled_on_speed():
     wanted = np.concatenate(CAR.states_and_inputs(plan, t))
     costs = []
     for loop in (ours, theirs):
-        found = cp.simulate(loop, t, initial_state=start)
+        found = cp.simulate(loop, t, initial_state=start, rtol=1e-6)
         e = np.array([found.outputs[name] for name in names]) - wanted
         rates = np.einsum("it,ij,jt->t", e[:3], q, e[:3]) + np.einsum("it,ij,jt->t", e[3:], r, e[3:])
         costs.append(np.trapezoid(rates, t) + e[:3, -1] @ final @ e[:3, -1])

@@ -13,7 +13,11 @@ B = sp.exp(-T) * (sp.Rational(3, 2) + T**2)
 
 
 def jet(expression, order=ORDER):
-    return np.array([float(expression.diff(T, k).subs(T, sp.Rational(1, 3)).evalf(25)) for k in range(order + 1)])
+    found = []
+    for _ in range(order + 1):
+        found.append(float(expression.subs(T, sp.Rational(1, 3)).evalf(25)))
+        expression = expression.diff(T)
+    return np.array(found)
 
 
 def of(expression, order=ORDER):

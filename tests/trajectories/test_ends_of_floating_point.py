@@ -23,6 +23,8 @@ from ctrlplan.trajectories import (
     stack,
 )
 
+pytestmark = pytest.mark.every_combination
+
 REST = [Waypoint(0, 0, 0, 0), Waypoint(10, 1, 0, 0)]
 MOVING = [Waypoint(0, 0, 0, 0), Waypoint(4, 1, 0.5, 0.25), Waypoint(10, 1, 0, 0)]
 QUINTIC = PolySpline(REST)

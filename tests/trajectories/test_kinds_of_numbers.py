@@ -23,6 +23,8 @@ from ctrlplan.trajectories import (
     residual_spectrum,
 )
 
+pytestmark = pytest.mark.every_combination
+
 
 class Quantity(float):
     """A number with a unit, as pint's."""

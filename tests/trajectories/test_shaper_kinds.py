@@ -379,6 +379,7 @@ def test_spectra_that_are_rejected(frequencies, response, options, message):
         Shaper.fit(frequencies, response, **options)
 
 
+@pytest.mark.every_combination
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("damping", [1.0, 1.5, -0.1, math.nan, math.inf])
 @pytest.mark.parametrize("frequency", [1.0, 0.0, -1.0, math.nan])

@@ -14,7 +14,7 @@ from ctrlplan.trajectories import Trajectory, Waypoint
 from ctrlplan.trajectories.export import ENDINGS
 
 # Data drawn at random and every alpha: most of these plans swing, on purpose.
-pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+pytestmark = [pytest.mark.every_combination, pytest.mark.filterwarnings("ignore:the plan swings")]
 
 EXPORTED = {name: getattr(trajectories, name) for name in trajectories.__all__}
 KINDS = {
