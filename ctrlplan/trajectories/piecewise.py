@@ -23,7 +23,7 @@ from ctrlplan.trajectories.pieces import Pieces, Run, scales
 from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
 from ctrlplan.trajectories.piecewise_fit import Frame
 from ctrlplan.trajectories.polynomial import PolySpline
-from ctrlplan.trajectories.sampling import FEW, sample_segments
+from ctrlplan.trajectories.sampling import FEW, place_entries, sample_segments
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
 from ctrlplan.trajectories.waypoint import Entries, Waypoint
@@ -420,10 +420,12 @@ class PiecewiseSpline(WaypointSpline):
         duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
         u, scale = s / duration, derivative_scale(duration, order)[:, None, None]
         if len(self._pieces) == 1:
-            return self._pieces[0].jet(segment, u, order) * scale
-        out = np.empty((order + 1, self.naxes, u.size))
-        for pieces in self._pieces:
-            out[:, list(pieces.axes)] = pieces.jet(segment, u, order) * scale
+            out = self._pieces[0].jet(segment, u, order) * scale
+        else:
+            out = np.empty((order + 1, self.naxes, u.size))
+            for pieces in self._pieces:
+                out[:, list(pieces.axes)] = pieces.jet(segment, u, order) * scale
+        self._place_filled(np.array([segment]).repeat(s.size), s, 0, out)
         return out
 
     def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
@@ -446,11 +448,21 @@ class PiecewiseSpline(WaypointSpline):
         h = self._durations[segments]
         u, scale = s / h, scales(h, high)[low:, None]
         if len(self._pieces) == 1:
-            return self._pieces[0].jets(segments, u, high)[low:] * scale
-        out = np.empty((high - low + 1, self.naxes, s.size))
-        for pieces in self._pieces:
-            out[:, list(pieces.axes)] = pieces.jets(segments, u, high)[low:] * scale
+            out = self._pieces[0].jets(segments, u, high)[low:] * scale
+        else:
+            out = np.empty((high - low + 1, self.naxes, s.size))
+            for pieces in self._pieces:
+                out[:, list(pieces.axes)] = pieces.jets(segments, u, high)[low:] * scale
+        self._place_filled(segments, s, low, out)
         return out
+
+    def _place_filled(self, segments: NDArray[np.intp], s: Array, low: int, out: Array) -> None:
+        """Replace derivatives, from an order on, at ends of segments: they are the entries there in every bit."""
+        entries = self._filled[:, low : low + len(out)].transpose(2, 1, 0)
+        for end, moments in enumerate((0.0, self._durations[segments])):
+            where = (s == moments).nonzero()[0]
+            if where.size:
+                place_entries(entries[segments[where] + end], where, out)
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         if t.size == 1:

@@ -191,15 +191,15 @@ def _sample_grouped(
         evaluate(zip(rows, [0, *bounds[:-1]], bounds, strict=True), t - origin, durations, out)
     where = (t == (ends.repeat(counts) if left else origin)).nonzero()[0]
     if where.size:
-        _place_entries(entries[segments.repeat(counts)[where] + left], where, out)
+        place_entries(entries[segments.repeat(counts)[where] + left], where, out)
     if segments[-1] == times.size - 2 and not left:  # the end belongs to the last segment
         where = (t[bounds[-1] - counts[-1] :] == times[-1]).nonzero()[0] + (bounds[-1] - counts[-1])
         if where.size:
-            _place_entries(entries[[-1]], where, out)
+            place_entries(entries[[-1]], where, out)
     return _are_finite(rows)
 
 
-def _place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
+def place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
     """Replace the lowest derivatives at some times by those that are known, (ntimes, k, naxes)."""
     rows, place = known.transpose(1, 2, 0), out[: known.shape[1]]
     free = np.isnan(rows)
