@@ -146,15 +146,12 @@ def alike(known: NDArray[np.bool_]) -> list[tuple[int, ...]]:
 
 def _check_durations(times: Array, period: float | None) -> None:
     """Raise if a duration overflows, or if waypoints do not fit into a period."""
-    if period is not None and times[-1] >= times[0] + period:
+    start, last = float(times[0]), float(times[-1])
+    end = last if period is None else start + period
+    if not end - start < np.inf:
+        raise ValueError(f"duration must be finite and above 0, got {end} s after {start} s")
+    if period is not None and last >= end:
         raise ValueError(
             f"waypoints of a cyclic plan must lie within one period of {period:g} s from the first, "
-            f"got waypoints[{times.size - 1}].time = {times[-1]}"
+            f"got waypoints[{times.size - 1}].time = {last}"
         )
-    if float(times[-1]) - float(times[0]) < np.inf:
-        return
-    with np.errstate(over="ignore"):
-        far = np.flatnonzero(~np.isfinite(np.diff(times)))
-    if far.size:
-        start, end = times[far[0] : far[0] + 2].tolist()
-        raise ValueError(f"duration must be finite and above 0, got {end} s after {start} s")
