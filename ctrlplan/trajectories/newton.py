@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from scipy.linalg import blas
 
 from ctrlplan._types import Value
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy, transform, unit_points
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy, evenly, last_coefficients, unit_points
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
 from ctrlplan.trajectories.fields import Fields
@@ -56,7 +56,7 @@ from ctrlplan.trajectories.one_time import (
     trigonometric_series,
 )
 from ctrlplan.trajectories.quadrature import gauss
-from ctrlplan.trajectories.sampling import in_products
+from ctrlplan.trajectories.sampling import in_products, products_of_values
 
 _MEET = 0.25
 """The ends coincide if their distance on the circle is below this fraction of that to all neighbours."""
@@ -80,7 +80,7 @@ _MAXIMUM_DIGITS = 100
 """Maximum number of constraints for decimal arithmetic, which then takes a fraction of a second."""
 
 _RESOLVED = 3e-14
-"""Size of the last coefficients of an interpolant relative to the largest, below which others do not matter."""
+"""Size of the last coefficients of an interpolant relative to its mean, below which others do not matter."""
 
 _ELEMENTARY = 3
 """Highest order of Taylor coefficients from elementary symmetric sums."""
@@ -372,8 +372,8 @@ class NewtonSystem(Fields):
         By the products of `sampling`; None where they are not resolved.
         """
         if (low, high) not in self._interpolants:
-            found = self._chebyshev(low, high)
-            self._interpolants[low, high] = None if found is None else readonly(in_products(found))
+            found = self._new_interpolant(low, high)
+            self._interpolants[low, high] = None if found is None else readonly(found)
         return self._interpolants[low, high]
 
     @cached_property
@@ -381,23 +381,28 @@ class NewtonSystem(Fields):
         """Interpolants by lowest and highest order."""
         return {}
 
-    def _chebyshev(self, low: int, high: int) -> Array | None:
-        """Chebyshev coefficients of derivatives of the basis on the unit interval; None where they are not resolved."""
+    def _new_interpolant(self, low: int, high: int) -> Array | None:
+        """As `interpolant`, from values at Chebyshev points."""
         # A polynomial is its own interpolant; other functions have more terms. An even number of points avoids the
         # middle of the interval, where a waypoint often is.
         terms = self.size + math.ceil(self.alpha and 10.0 + self.alpha * (2.3 + 0.18 * self.size))
-        u, scale = unit_points(terms + terms % 2 - 1), FACTORIALS[: high + 1, None, None]
-        found = transform(self.taylor_between(u, high)[low:] * scale[low:])
+        count = terms + terms % 2
+        values = self.taylor_between(unit_points(count - 1), high)
+        for order in range(2, high + 1):
+            values[order] *= math.factorial(order)
+        values = values[low:]
         if not self.alpha:
-            return found[..., :terms]
-        sizes = np.abs(found)
-        if not (sizes[..., -2:].max(axis=2) > _RESOLVED * sizes.max(axis=2)).any():
-            return found
+            return values @ products_of_values(count, terms)
+        last = np.abs(values @ last_coefficients(count))
+        means = np.abs(values) @ evenly(count)
+        if (np.maximum(last[..., 0], last[..., 1]) <= _RESOLVED * means).all():
+            return values @ products_of_values(count, count)
 
         def jet(u: Array, order: int) -> Array:
-            return self.taylor(u, order).transpose(1, 0, 2) * scale[: order + 1]
+            return self.taylor(u, order).transpose(1, 0, 2) * FACTORIALS[: order + 1, None, None]
 
-        return chebyshev_proxy(jet, (0.0, 1.0), low, high)
+        found = chebyshev_proxy(jet, (0.0, 1.0), low, high)
+        return None if found is None else in_products(found)
 
     def series(self, coefficients: Array, u: Value, order: int) -> list[list[Value]]:
         """Taylor series of each axis at one normalised time, a number or a symbol."""

@@ -260,8 +260,8 @@ class NewtonSpline(WaypointSpline):
             rows = np.zeros((high - low + 1, self.naxes, max([own.shape[2] for _, own in found])))
             for axes, own in found:
                 rows[:, list(axes), : own.shape[2]] = own
-        powers = self._duration ** -np.arange(low, high + 1.0)
-        return Interpolant.of(rows * powers[:, None, None])
+        powers = np.array([[[self._duration**-k]] for k in range(low, high + 1)])
+        return Interpolant.of(rows * powers)
 
     def _end_jet(self, segment: int, s: float, order: int) -> Array:
         # What a waypoint prescribes is not computed.

@@ -23,7 +23,7 @@ from ctrlplan.trajectories.pieces import Pieces, Run, scales
 from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
 from ctrlplan.trajectories.piecewise_fit import Frame
 from ctrlplan.trajectories.polynomial import PolySpline
-from ctrlplan.trajectories.sampling import FEW, place_entries, sample_segments
+from ctrlplan.trajectories.sampling import FEW, are_finite, place_entries, sample_segments
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
 from ctrlplan.trajectories.waypoint import Entries, Waypoint
@@ -472,7 +472,8 @@ class PiecewiseSpline(WaypointSpline):
         if self._is_extreme(high) or not t.size:
             return super()._sample(t, low, high, left)
         times = self.breakpoints
-        first, last = float(t.min()), float(t.max())
+        is_sorted = bool((t[1:] >= t[:-1]).all())
+        first, last = (t.item(0), t.item(-1)) if is_sorted else (float(t.min()), float(t.max()))
         if not (first > times[0] if left else first >= times[0]) or not last <= times[-1]:
             inside = (t > times[0] if left else t >= times[0]) & (t <= times[-1])
             if np.count_nonzero(inside) <= _FEW:
@@ -482,37 +483,40 @@ class PiecewiseSpline(WaypointSpline):
             out[:, :, ~inside] = super()._sample(t[~inside], low, high, left)
             return out
         with np.errstate(over="ignore", invalid="ignore"):
-            out, finite = self._sample_inside(t, low, high, left)
+            out, finite = self._sample_inside(t, is_sorted, low, high, left)
         return out if finite or np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
-    def _sample_inside(self, t: Array, low: int, high: int, left: bool) -> tuple[Array, bool]:
+    def _sample_inside(self, t: Array, is_sorted: bool, low: int, high: int, left: bool) -> tuple[Array, bool]:
         """Derivatives low to high at times of the plan, and whether they are certainly finite."""
         times = self.breakpoints
         if t.size > FEW and all([pieces.is_resolved(low, high) for pieces in self._pieces]):
             out = np.empty((high - low + 1, self.naxes, t.size))
             entries = self._filled[:, low : high + 1].transpose(2, 1, 0)
-            known = self._known_rows(low, high)
-            finite = sample_segments(
-                times, lambda own: self._rows_of(own, low, high) if known is None else known[own], entries, t, left, out
-            )
-            return out, finite
+
+            def rows_of(segments: NDArray[np.intp]) -> tuple[Array, bool]:
+                if times.size > _FEW:
+                    rows = self._rows_of(segments, low, high)
+                    return rows, are_finite(rows)
+                rows, finite = self._known_rows(low, high)
+                return (rows if segments.size == len(rows) else rows[segments]), finite
+
+            return out, sample_segments(times, rows_of, entries, t, is_sorted, left, out)
         segments = times[1:-1].searchsorted(t, side="left" if left else "right")
         touched = int(np.count_nonzero(segments[1:] != segments[:-1])) + 1
         if touched <= _FEW:
             return super()._sample(t, low, high, left), True
         return self._jets(segments, t - times[segments], low, high), False
 
-    def _known_rows(self, low: int, high: int) -> Array | None:
-        """Rows of interpolants of all segments, kept with a plan of few segments; None for others."""
-        if self._durations.size > _FEW:
-            return None
+    def _known_rows(self, low: int, high: int) -> tuple[Array, bool]:
+        """Rows of interpolants of all segments of a plan of few, which are kept, and whether they are finite."""
         if (low, high) not in self._rows_by_orders:
-            self._rows_by_orders[low, high] = readonly(self._rows_of(np.arange(self._durations.size), low, high))
+            rows = readonly(self._rows_of(np.arange(self._durations.size), low, high))
+            self._rows_by_orders[low, high] = rows, are_finite(rows)
         return self._rows_by_orders[low, high]
 
     @cached_property
-    def _rows_by_orders(self) -> dict[tuple[int, int], Array]:
-        """Rows of interpolants by lowest and highest order."""
+    def _rows_by_orders(self) -> dict[tuple[int, int], tuple[Array, bool]]:
+        """The same by lowest and highest order."""
         return {}
 
     def _rows_of(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
