@@ -36,7 +36,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,38 +156,37 @@ class NewtonSystem(Fields):
         if count == 0:
             raise ValueError("an axis must have at least one prescribed entry, got none")
         size = count if size is None else size
-        waypoints, orders, lead = _constraints(effective(alpha), times, given, meet)
-        nodes = times[waypoints]
-        mean = math.fsum(nodes) / count
-        nodes = np.concatenate([nodes, _spare_nodes(mean, size - count)]) if size > count else nodes
+        moments = times.tolist()
+        ordered, meet = _leja(effective(alpha), moments, given, meet)
+        pattern = _pattern(ordered, given, meet)
+        mean = math.fsum([moments[i] for i in pattern.at]) / count
         phase, fold = _top_harmonic(alpha, size, mean, gamma)
+        nodes = times.take(pattern.waypoints)
+        beyond = times[:, None] - nodes if apart is None else apart.take(pattern.waypoints, axis=1)
+        if size > count:
+            spare = _spare_nodes(mean, size - count)
+            nodes, beyond = np.concatenate([nodes, spare]), np.hstack([beyond, times[:, None] - spare])
         self._set_fields(
             alpha=alpha,
             size=size,
             gamma=phase,
-            waypoint_index=waypoints,
-            order_index=orders,
-            _orders=tuple(orders.tolist()),
+            waypoint_index=pattern.waypoints,
+            order_index=pattern.orders,
+            hermite=pattern.hermite,
+            _orders=pattern.keys,
+            _positions=pattern.positions,
+            _anchor=pattern.anchor,
             _fold=fold,
             _nodes=readonly(nodes),
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
-            hermite=all([g == tuple(range(len(g))) for g in given]),
-            _positions=readonly((orders == 0).astype(float)[:, None]),
-            _anchor=int((orders == 0).argmax()),
         )
-        beyond = times[:, None] - nodes
-        if apart is not None:
-            beyond[:, :count] = apart[:, waypoints]
-        jets = self._taylor(beyond.T[: size - size % 2 : 2], beyond.T[1:size:2], max(self._orders))
-        collocation = jets[:, orders, waypoints].T
-        triangle, spread = (
-            (np.asfortranarray(collocation), None)
-            if self.hermite and size == count
-            else _factor(collocation, self.hermite, self.squared_samples(smooth) if size > count else None, lead)
-        )
-        self._set_fields(_triangle=readonly(triangle), _spread=spread)
-
+        collocation = self._collocation(beyond, pattern)
+        spread = None
+        if not pattern.hermite or size > count:
+            roughness = self.squared_samples(smooth) if size > count else None
+            collocation, spread = _factor(collocation, pattern.hermite, roughness, pattern.lead)
+        self._set_fields(_triangle=readonly(np.asfortranarray(collocation)), _spread=spread)
         if not self._triangle.diagonal().all():
             raise ValueError("the constraints must determine the plan, got a singular system")
 
@@ -320,6 +319,47 @@ class NewtonSystem(Fields):
         if self._fold:
             out[self.size - 1] += self._fold * out[self.size]
         return out[: self.size]
+
+    def _collocation(self, beyond: Array, pattern: _Pattern) -> Array:
+        """Prescribed Taylor coefficients (nconstraints, size) of every basis function.
+
+        As `_taylor`, by matrices that multiply series by the factors of each pair: fewer
+        steps, for few times.
+
+        Parameters
+        ----------
+        beyond : ndarray, shape (nwaypoints, size)
+            Distances of the waypoints to the nodes.
+        pattern : _Pattern
+            The constraints.
+        """
+        half, n = 0.5 * effective(self.alpha), max(pattern.keys) + 1
+        count, npairs = len(beyond), self.size // 2
+        angles = np.empty((3, npairs, count))  # of both factors of each pair, and their sum
+        np.multiply(beyond[:, : 2 * npairs].T.reshape(npairs, 2, count).swapaxes(0, 1), half or 1.0, out=angles[:2])
+        parts = np.empty((2, npairs, count, 3))  # of q c and of q q
+        np.add(angles[0], angles[1], out=angles[2])
+        if half:
+            cosines, angles = np.cos(angles[1:]), np.sin(angles)
+            np.multiply(angles[0], cosines[0], out=parts[0, ..., 0])
+        else:
+            cosines = np.ones((2, 1, 1))
+            parts[0, ..., 0] = angles[0]
+        np.multiply(angles[0], angles[1], out=parts[1, ..., 0])
+        parts[..., 1], parts[..., 2] = cosines[1], angles[2]
+        factors = (parts.reshape(2, npairs * count, 3) @ _pair_kernel(self.alpha, n - 1)).reshape(
+            2, npairs, count, n, n
+        )
+        series = np.zeros((npairs + 1, count, n, 1))
+        series[0, :, 0] = 1.0
+        for j in range(npairs if self._fold or self.size % 2 else npairs - 1):  # the last product may not be used
+            np.matmul(factors[1, j], series[j], out=series[j + 1])
+        out = np.empty((2 * npairs + 1, count, n))
+        out[::2] = series[..., 0]
+        out[1::2] = (factors[0] @ series[:-1])[..., 0]
+        if self._fold:
+            out[self.size - 1] += self._fold * out[self.size]
+        return np.asarray(out[: self.size, pattern.waypoints, pattern.orders].T)
 
     def taylor_between(self, u: Array, order: int) -> Array:
         r"""As `taylor`, faster at few times, none of which is a node.
@@ -654,60 +694,92 @@ def _grid(count: int) -> Array:
     return readonly(np.linspace(0.0, 1.0, count))
 
 
-def _constraints(
-    alpha: float, times: Array, given: tuple[tuple[int, ...], ...], meet: bool
-) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
-    """Waypoint and order of each constraint, in the order of the Newton form.
+class _Pattern(NamedTuple):
+    """Constraints in the order of the Newton form.
 
-    Waypoints are in Leja order: each maximises the product of its distances to
-    the previous ones. Ends that coincide on the circle come first with all their
-    entries, whose number is returned: as their data agree, the divided
-    differences between them are 0 or small, and no others are divided by their
-    distance.
+    Attributes
+    ----------
+    at, keys : tuple of int
+        Waypoint and order of each constraint.
+    waypoints, orders : ndarray of int, shape (nconstraints,)
+        The same as arrays.
+    positions : ndarray, shape (nconstraints, 1)
+        1 for a prescribed position, else 0.
+    anchor : int
+        First prescribed position.
+    hermite : bool
+        Whether no order is left out at any waypoint.
+    lead : int
+        Number of constraints of ends that coincide.
+    """
+
+    at: tuple[int, ...]
+    keys: tuple[int, ...]
+    waypoints: NDArray[np.intp]
+    orders: NDArray[np.intp]
+    positions: Array
+    anchor: int
+    hermite: bool
+    lead: int
+
+
+@lru_cache(maxsize=256)
+def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> _Pattern:
+    """Constraints of waypoints in Leja order; ends that coincide come first with all their entries."""
+    first = _sequence(ordered[:2], given) if meet else []
+    pairs = first + _sequence(ordered[2:] if meet else ordered, given)
+    at, keys = (tuple(column) for column in zip(*pairs, strict=True))
+    orders = np.array(keys, dtype=np.intp)
+    waypoints, positions = np.array(at, dtype=np.intp), (orders == 0).astype(float)[:, None]
+    for array in (orders, waypoints, positions):
+        array.flags.writeable = False
+    hermite = all([own == tuple(range(len(own))) for own in given])
+    return _Pattern(at, keys, waypoints, orders, positions, int((orders == 0).argmax()), hermite, len(first))
+
+
+def _leja(
+    alpha: float, times: list[float], given: tuple[tuple[int, ...], ...], meet: bool
+) -> tuple[tuple[int, ...], bool]:
+    """Waypoints in Leja order, and whether the ends coincide on the circle.
+
+    Each maximises the product of its distances to the previous ones. Ends that
+    coincide come first: as their data agree, the divided differences between them
+    are 0 or small, and no others are divided by their distance.
     """
     used = [i for i, g in enumerate(given) if g]
-    u, half = times[used].tolist(), 0.5 * alpha
+    u, half, sin = [times[i] for i in used], 0.5 * alpha, math.sin
 
     def distances(v: float) -> list[float]:
-        return [abs(math.sin(half * (w - v)) if half else w - v) for w in u]
+        return [abs(sin(half * (w - v))) for w in u] if half else [abs(w - v) for w in u]
 
     product = distances(u[0])
     if meet:
         nearest = min([distances(v)[i] for i, v in enumerate(u[:-1], 1)], default=0.0)
         meet = len(used) > 2 and product[-1] < _MEET * nearest
     chosen = [0]
-    while len(chosen) < len(u):
+    while len(chosen) < len(u) - 1:
         # Rescaled, so that the products do not underflow for many waypoints.
         farthest = len(u) - 1 if meet and len(chosen) == 1 else product.index(max(product))
         scale = product[farthest] or 1.0
         product = [p * (d / scale) for p, d in zip(product, distances(u[farthest]), strict=True)]
         chosen.append(farthest)
-    ordered = [used[i] for i in chosen]
-    if not meet:
-        return *_sequence(ordered, given), 0
-    (first, rank), (others, ranks) = _sequence(ordered[:2], given), _sequence(ordered[2:], given)
-    return np.concatenate([first, others]), np.concatenate([rank, ranks]), len(first)
+    chosen += set(range(len(u))) - set(chosen)
+    return tuple([used[i] for i in chosen]), meet
 
 
-def _sequence(waypoints: list[int], given: tuple[tuple[int, ...], ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _sequence(waypoints: tuple[int, ...], given: tuple[tuple[int, ...], ...]) -> list[tuple[int, int]]:
     """Constraints in rounds through the waypoints, those of each waypoint distributed evenly over all rounds.
 
     Orders increase at each waypoint, as the triangle requires, and at every stage
     the nodes are distributed like all of them. Otherwise waypoints with few
     entries before long jets elsewhere cost four digits.
     """
-    lengths = set(map(len, given))
-    if len(lengths) == 1:  # the same order, computed faster
-        rows = [(i, given[i][turn]) for turn in range(lengths.pop()) for i in waypoints]
-        table = np.array(rows, dtype=np.intp)
-        return table[:, 0], table[:, 1]
     pairs = [
         ((turn + 1) / len(given[i]), rank, i, order)
         for rank, i in enumerate(waypoints)
         for turn, order in enumerate(given[i])
     ]
-    table = np.array([(i, order) for _, _, i, order in sorted(pairs)], dtype=np.intp)
-    return table[:, 0], table[:, 1]
+    return [(i, order) for _, _, i, order in sorted(pairs)]
 
 
 def _spare_nodes(mean: float, count: int) -> Array:
@@ -780,6 +852,20 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: in
             )
         spread = spread + basis[:, count:] @ free
     return np.asfortranarray(triangle), spread
+
+
+@lru_cache(maxsize=256)
+def _pair_kernel(alpha: float, order: int) -> Array:
+    """Multiplication of a Taylor jet by the factors of a pair: shape (2, 3, (order + 1)^2), of q c and of q q.
+
+    From sin a cos b and sin a sin b, cos(a + b) and sin(a + b), with the angles a and b
+    of both factors; from a and a b, 1 and a + b of a polynomial.
+    """
+    alpha = effective(alpha)
+    one, s, v = _kernel(alpha, order).reshape(3, -1)
+    half = 0.5 * alpha or 1.0
+    single = [one / half, s, -half * v if alpha else 0.0 * v]
+    return readonly(np.array([single, [one / half**2, v, s / half]]))
 
 
 @lru_cache(maxsize=256)
