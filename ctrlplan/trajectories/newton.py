@@ -34,8 +34,9 @@ inside out (`one_time`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
+from operator import mul
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -81,6 +82,9 @@ _MAXIMUM_DIGITS = 100
 
 _RESOLVED = 3e-14
 """Size of the last coefficients of an interpolant relative to its mean, below which others do not matter."""
+
+_SHORT = 4
+"""Maximum number of waypoints whose coefficients bound the range of a plan."""
 
 _ELEMENTARY = 3
 """Highest order of Taylor coefficients from elementary symmetric sums."""
@@ -134,6 +138,7 @@ class NewtonSystem(Fields):
     _orders: tuple[int, ...]  # `order_index` as a key
     _positions: Array  # 1 for a prescribed position, else 0
     _anchor: int
+    _is_short: int
     _triangle: Array
     _spread: Array | None
     _fold: float
@@ -176,6 +181,7 @@ class NewtonSystem(Fields):
             _orders=pattern.keys,
             _positions=pattern.positions,
             _anchor=pattern.anchor,
+            _is_short=pattern.is_short,
             _fold=fold,
             _nodes=readonly(nodes),
             _first=nodes[0 : size - size % 2 : 2],
@@ -523,30 +529,42 @@ class NewtonSystem(Fields):
         return out[: self.size]
 
     @cached_property
-    def ranges(self) -> tuple[float, ...]:
+    def ranges(self) -> list[float]:
         """Bounds of the ranges of the basis functions from the second on, over the unit interval."""
-        first, second = self._first.tolist(), self._second.tolist()
-        return _ranges(effective(self.alpha), tuple(first), tuple(second))[: self.size - 1]
+        return _ranges(effective(self.alpha), self._nodes.tolist())[: self.size - 1]
 
     @cached_property
     def higher_ranges(self) -> Array:
         """The same from the third function on, as an array."""
         return readonly(np.array(self.ranges[1:]))
 
-    def stays_near(self, coefficients: Array, factor: float) -> bool:
-        """Whether coefficients exclude a range above a multiple of the distance of the first two positions.
+    def stays_near(self, coefficients: Array, factor: float, spans: Callable[[], list[float]]) -> bool:
+        """Whether coefficients exclude ranges above a multiple of those of the positions.
 
-        Only of functions between two waypoints, whose ranges do not depend on the
-        times; otherwise the values of all functions are as fast as their ranges.
+        Only for few waypoints; otherwise values of all functions are as fast as their
+        ranges, and say more.
+
+        Parameters
+        ----------
+        coefficients : ndarray, shape (size, naxes)
+            Coefficients of some axes.
+        factor : float
+            The multiple.
+        spans : callable
+            Returns the ranges of the prescribed positions of these axes; it is not
+            called for two waypoints.
         """
-        if self._fold or self._orders[:2] != (0, 0) or self.waypoint_index.max() > 1:
+        if self._fold or not self._is_short:
             return False
-        first, *others = self.ranges
-        allowed = factor * abs(self._triangle.item(1, 1)) - first
-        for _, slope, *column in coefficients.T.tolist():
-            if not sum([abs(c) * r for c, r in zip(column, others, strict=True)]) <= allowed * abs(slope):
-                return False
-        return True
+        columns, ranges = coefficients.T.tolist(), self.ranges
+        if self._is_short == 2:
+            slope = factor * abs(self._triangle.item(1, 1))
+            allowed = [slope * abs(column[1]) for column in columns]
+        else:
+            allowed = [factor * span for span in spans()]
+        return all(
+            [sum(map(mul, map(abs, column[1:]), ranges)) <= most for column, most in zip(columns, allowed, strict=True)]
+        )
 
     @cached_property
     def amplification(self) -> float:
@@ -637,9 +655,8 @@ def _taylor_scale(duration: float, orders: tuple[int, ...]) -> Array:
     return readonly(scale)
 
 
-@lru_cache(maxsize=256)
-def _ranges(alpha: float, first: tuple[float, ...], second: tuple[float, ...]) -> tuple[float, ...]:
-    """Bounds of the ranges of the basis functions from the second on, from the nodes of each pair.
+def _ranges(alpha: float, nodes: list[float]) -> list[float]:
+    """Bounds of the ranges of the basis functions from the second on, from the nodes.
 
     Between the nodes a and b of a pair the product of both factors is largest at their
     mean, outside at the end that is farther from it. Functions with nodes at the ends
@@ -647,24 +664,35 @@ def _ranges(alpha: float, first: tuple[float, ...], second: tuple[float, ...]) -
     """
     found: list[float] = []
     product, signed, alternate = 1.0, True, True  # signs do not change; each pair before has a node at each end
-    for a, b in zip(first, second, strict=True):
-        mean, apart, alone = 0.5 * (a + b), abs(b - a), max(a, 1.0 - a)
-        far = max(mean, 1.0 - mean)
-        if alpha:
-            alone = 2.0 / alpha * math.sin(min(0.5 * alpha * alone, 0.5 * math.pi))
-            inner = math.cos(0.5 * alpha * apart)
-            pair = 2.0 / alpha**2 * max(1.0 - inner, inner - math.cos(min(alpha * far, math.pi)))
-        else:
-            pair = max(0.25 * apart**2, far**2 - 0.25 * apart**2)
-        at_end = a in (0.0, 1.0)
-        if alternate and at_end and alpha <= math.pi:
+    peaks: dict[tuple[float, float], tuple[float, float]] = {}
+    few = alpha <= math.pi
+    for a, b in zip(nodes[::2], nodes[1::2], strict=False):
+        if (a, b) not in peaks:
+            peaks[a, b] = _pair_peaks(alpha, a, b)
+        alone, pair = peaks[a, b]
+        at_end = few and (a == 0.0 or a == 1.0)
+        if alternate and at_end:
             found.append(_odd_peak(alpha, len(found) // 2))
         else:
-            found.append(product * alone * (1.0 if signed and at_end and alpha <= math.pi else 2.0))
-        alternate = alternate and apart == 1.0
-        product, signed = product * pair, signed and at_end and b in (0.0, 1.0)
+            found.append(product * alone * (1.0 if signed and at_end else 2.0))
+        alternate = alternate and abs(b - a) == 1.0
+        product, signed = product * pair, signed and (a in _ENDS and b in _ENDS)
         found.append(product * (1.0 if signed else 2.0))
-    return tuple(found)
+    return found
+
+
+_ENDS = (0.0, 1.0)
+
+
+def _pair_peaks(alpha: float, a: float, b: float) -> tuple[float, float]:
+    """Maxima of the first factor of a pair of nodes, and of the product of both."""
+    mean, apart, alone = 0.5 * (a + b), abs(b - a), max(a, 1.0 - a)
+    far = max(mean, 1.0 - mean)
+    if not alpha:
+        return alone, max(0.25 * apart**2, far**2 - 0.25 * apart**2)
+    inner = math.cos(0.5 * alpha * apart)
+    pair = 2.0 / alpha**2 * max(1.0 - inner, inner - math.cos(min(alpha * far, math.pi)))
+    return 2.0 / alpha * math.sin(min(0.5 * alpha * alone, 0.5 * math.pi)), pair
 
 
 @lru_cache(maxsize=256)
@@ -711,6 +739,8 @@ class _Pattern(NamedTuple):
         Whether no order is left out at any waypoint.
     lead : int
         Number of constraints of ends that coincide.
+    is_short : int
+        Number of waypoints if they are few and begin with their positions, else 0.
     """
 
     at: tuple[int, ...]
@@ -721,6 +751,7 @@ class _Pattern(NamedTuple):
     anchor: int
     hermite: bool
     lead: int
+    is_short: int
 
 
 @lru_cache(maxsize=256)
@@ -734,7 +765,9 @@ def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet:
     for array in (orders, waypoints, positions):
         array.flags.writeable = False
     hermite = all([own == tuple(range(len(own))) for own in given])
-    return _Pattern(at, keys, waypoints, orders, positions, int((orders == 0).argmax()), hermite, len(first))
+    number = len(set(at))
+    is_short = number if 2 <= number <= _SHORT and keys[:number] == (0,) * number else 0
+    return _Pattern(at, keys, waypoints, orders, positions, int((orders == 0).argmax()), hermite, len(first), is_short)
 
 
 def _leja(

@@ -174,7 +174,14 @@ class NewtonSpline(WaypointSpline):
 
     def _check_swing(self) -> None:
         """Warn, unless disabled, if the plan swings far beyond its waypoints."""
-        if not self._options.warn or all([s.stays_near(c, MAXIMUM_SWING) for _, s, c in self._parts]):
+        if not self._options.warn:
+            return
+
+        def spans() -> list[float]:
+            positions = zip(*[w.jet[0].tolist() for w in self.waypoints], strict=True)
+            return [max(own) - min(own) for own in positions]
+
+        if len(self._parts) == 1 and self._parts[0][1].stays_near(self._parts[0][2], MAXIMUM_SWING, spans):
             return
         if len(self._parts) == 1:
             _, system, coefficients = self._parts[0]

@@ -392,7 +392,7 @@ class PiecewiseSpline(WaypointSpline):
         if self.alpha > math.pi:
             return False
         positions = self._entries.rows[:, 0]
-        lowest, highest = positions.min(axis=1), positions.max(axis=1)
+        lowest, highest = np.minimum.reduce(positions, axis=1), np.maximum.reduce(positions, axis=1)
         allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (highest - lowest)
         for pieces in self._pieces:
             axes = list(pieces.axes)
@@ -403,10 +403,10 @@ class PiecewiseSpline(WaypointSpline):
                 if not weights.size:
                     continue
                 sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
-                own = (weights @ sizes).reshape(len(axes), -1)
-                if (own.max(axis=1) <= allowed[axes]).all():
+                near = (weights @ sizes).reshape(len(axes), -1) <= allowed[axes, None]
+                if near.all():
                     continue
-                low, high = _range(run, np.flatnonzero(~(own <= allowed[axes, None]).all(axis=0)))
+                low, high = _range(run, np.flatnonzero(~near.all(axis=0)))
                 if not ((low >= (lowest - allowed)[axes]) & (high <= (highest + allowed)[axes])).all():
                     return False
         return True
