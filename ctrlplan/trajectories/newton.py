@@ -215,8 +215,8 @@ class NewtonSystem(Fields):
         if self._inverse is None or taylor_data.dtype != np.float64:
             return self.coefficients_of(taylor_data)
         offset = taylor_data[self._anchor].copy()
-        for row, position in zip(taylor_data, self._positions, strict=True):
-            if position:
+        for row, order in zip(taylor_data, self._orders, strict=True):
+            if not order:
                 row -= offset
         found: Array = self._inverse @ taylor_data
         found[0] += offset

@@ -250,7 +250,7 @@ class PiecewiseSpline(WaypointSpline):
     ) -> None:
         """Set all fields but the waypoints; what does not depend on values is taken from a `donor` at equal times."""
         unknown = np.isnan(entries.rows)
-        if donor is not None and np.array_equal(unknown, donor._frame.unknown):
+        if donor is not None and donor._frame.has(unknown):
             frame, names = donor._frame, donor.labels
         else:
             frame = Frame(alpha, entries.times, period, unknown)
