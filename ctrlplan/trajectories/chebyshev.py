@@ -97,6 +97,18 @@ def transform(values: Array) -> Array:
 
 
 @lru_cache(maxsize=64)
+def last_coefficients(count: int) -> Array:
+    """Matrix (count, 2) from values at `points` to the last two coefficients."""
+    return readonly(_matrix(count - 1)[:, -2:].copy())
+
+
+@lru_cache(maxsize=64)
+def evenly(count: int) -> Array:
+    """Weights (count,) of a mean."""
+    return readonly(np.full(count, 1.0 / count))
+
+
+@lru_cache(maxsize=64)
 def _colleague(degree: int) -> Array:
     """Symmetric colleague matrix of the Chebyshev polynomial of a degree."""
     off = np.full(degree - 1, 0.5)
@@ -112,6 +124,7 @@ def _nodes(degree: int) -> Array:
 @lru_cache(maxsize=64)
 def _matrix(degree: int) -> Array:
     n = degree + 1
-    matrix = (2.0 / n) * np.cos(np.pi * np.outer(np.arange(n) + 0.5, np.arange(n)) / n)
+    quarters = np.outer(2 * np.arange(n) + 1, np.arange(n)) % (4 * n)  # the angle within one turn: no digits are lost
+    matrix = (2.0 / n) * np.cos((0.5 * np.pi / n) * quarters)
     matrix[:, 0] *= 0.5
     return matrix

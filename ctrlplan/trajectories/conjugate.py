@@ -87,6 +87,16 @@ class Kind:
         return slice(self.first, self.last)
 
     @cached_property
+    def entries(self) -> list[tuple[int, int]]:
+        """End and order of each entry."""
+        return [(end, order) for end, orders in enumerate(self.ends) for order in orders]
+
+    @cached_property
+    def is_relative(self) -> bool:
+        """Whether positions are relative to the start of a segment: its functions include the constants."""
+        return 0 in self.ends[0] and 0 in self.ends[1]
+
+    @cached_property
     def sides(self) -> NDArray[np.intp]:
         """End of each entry, 0 or 1."""
         return np.repeat([0, 1], [len(orders) for orders in self.ends])
@@ -155,10 +165,19 @@ class FreePattern:
         self.conjugate = 2 * self.size - 1 - self.free_orders
         self.places = self.orders * self.count + self.nodes
         """Place of each unknown among the entries of an axis."""
+        self.lowest = self._lowest(free)
+        """Lowest free order, if all inner waypoints and no others have all orders from it on free; None otherwise."""
         self.rows = np.searchsorted(self.free_orders, self.orders) * (self.count + closed) + self.nodes
         """Place of each equation among the jumps of an axis."""
         self.prescribed = [self._prescribed(kind) for kind in self.kinds]
         self.first_position = int(given[:, 0].argmax()) if given[:, 0].any() else None
+
+    def _lowest(self, free: NDArray[np.bool_]) -> int | None:
+        inner = free[1:-1]
+        if self.closed or self.natural or not inner.any():
+            return None
+        lowest = int(self.free_orders[0])
+        return lowest if inner[:, lowest:].all() else None
 
     @property
     def undetermined(self) -> str:
@@ -460,14 +479,15 @@ class FreeEntries:
         if pattern.closed:
             data = np.concatenate([data, data[:, :, :1]], axis=2)
         jumps = np.zeros((naxes, pattern.free_orders.size, data.shape[2]), dtype=data.dtype)
+        moving = data[:, 1:].any()
         for kind, factors, used in zip(pattern.kinds, terms, entries, strict=True):
-            # Positions relative to the start of each segment, whose functions include the constants.
-            relative = np.count_nonzero(kind.orders == 0) == 2
             for n, inside in used:
-                side, order = int(kind.sides[n]), int(kind.orders[n])
+                side, order = kind.entries[n]
+                if order and not moving:
+                    continue
                 left, right = kind.first + inside.start, kind.first + inside.stop
                 values = data[:, order, left + side : right + side]
-                if relative and not order:
+                if kind.is_relative and not order:
                     if not side:
                         continue
                     values = values - data[:, 0, left:right]

@@ -100,6 +100,10 @@ def as_trajectory(
 
     Notes
     -----
+    The option `extrapolate` of a spline of scipy has no effect: as every trajectory, the
+    result is constant before its start and after its end. Use ``.repeat(None)`` for a
+    spline with ``extrapolate="periodic"``.
+
     Dots in names of states and inputs become underscores. States and inputs of a
     SystemTrajectory are interpolated by quintic splines in each segment of its
     basis; `deviation` is measured between the samples. States of an

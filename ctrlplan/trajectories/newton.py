@@ -34,16 +34,17 @@ inside out (`one_time`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
-from typing import Any
+from operator import mul
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas
 
 from ctrlplan._types import Value
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy, transform, unit_points
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy, evenly, last_coefficients, unit_points
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
 from ctrlplan.trajectories.fields import Fields
@@ -56,7 +57,7 @@ from ctrlplan.trajectories.one_time import (
     trigonometric_series,
 )
 from ctrlplan.trajectories.quadrature import gauss
-from ctrlplan.trajectories.sampling import in_products
+from ctrlplan.trajectories.sampling import in_products, products_of_values
 
 _MEET = 0.25
 """The ends coincide if their distance on the circle is below this fraction of that to all neighbours."""
@@ -80,7 +81,10 @@ _MAXIMUM_DIGITS = 100
 """Maximum number of constraints for decimal arithmetic, which then takes a fraction of a second."""
 
 _RESOLVED = 3e-14
-"""Size of the last coefficients of an interpolant relative to the largest, below which others do not matter."""
+"""Size of the last coefficients of an interpolant relative to its mean, below which others do not matter."""
+
+_SHORT = 4
+"""Maximum number of waypoints whose coefficients bound the range of a plan."""
 
 _ELEMENTARY = 3
 """Highest order of Taylor coefficients from elementary symmetric sums."""
@@ -134,6 +138,7 @@ class NewtonSystem(Fields):
     _orders: tuple[int, ...]  # `order_index` as a key
     _positions: Array  # 1 for a prescribed position, else 0
     _anchor: int
+    _is_short: int
     _triangle: Array
     _spread: Array | None
     _fold: float
@@ -156,38 +161,38 @@ class NewtonSystem(Fields):
         if count == 0:
             raise ValueError("an axis must have at least one prescribed entry, got none")
         size = count if size is None else size
-        waypoints, orders, lead = _constraints(effective(alpha), times, given, meet)
-        nodes = times[waypoints]
-        mean = math.fsum(nodes) / count
-        nodes = np.concatenate([nodes, _spare_nodes(mean, size - count)]) if size > count else nodes
+        moments = times.tolist()
+        ordered, meet = _leja(effective(alpha), moments, given, meet)
+        pattern = _pattern(ordered, given, meet)
+        mean = math.fsum([moments[i] for i in pattern.at]) / count
         phase, fold = _top_harmonic(alpha, size, mean, gamma)
+        nodes = times.take(pattern.waypoints)
+        beyond = times[:, None] - nodes if apart is None else apart.take(pattern.waypoints, axis=1)
+        if size > count:
+            spare = _spare_nodes(mean, size - count)
+            nodes, beyond = np.concatenate([nodes, spare]), np.hstack([beyond, times[:, None] - spare])
         self._set_fields(
             alpha=alpha,
             size=size,
             gamma=phase,
-            waypoint_index=waypoints,
-            order_index=orders,
-            _orders=tuple(orders.tolist()),
+            waypoint_index=pattern.waypoints,
+            order_index=pattern.orders,
+            hermite=pattern.hermite,
+            _orders=pattern.keys,
+            _positions=pattern.positions,
+            _anchor=pattern.anchor,
+            _is_short=pattern.is_short,
             _fold=fold,
             _nodes=readonly(nodes),
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
-            hermite=all([g == tuple(range(len(g))) for g in given]),
-            _positions=readonly((orders == 0).astype(float)[:, None]),
-            _anchor=int((orders == 0).argmax()),
         )
-        beyond = times[:, None] - nodes
-        if apart is not None:
-            beyond[:, :count] = apart[:, waypoints]
-        jets = self._taylor(beyond.T[: size - size % 2 : 2], beyond.T[1:size:2], max(self._orders))
-        collocation = jets[:, orders, waypoints].T
-        triangle, spread = (
-            (np.asfortranarray(collocation), None)
-            if self.hermite and size == count
-            else _factor(collocation, self.hermite, self.squared_samples(smooth) if size > count else None, lead)
-        )
-        self._set_fields(_triangle=readonly(triangle), _spread=spread)
-
+        collocation = self._collocation(beyond, pattern)
+        spread = None
+        if not pattern.hermite or size > count:
+            roughness = self.squared_samples(smooth) if size > count else None
+            collocation, spread = _factor(collocation, pattern.hermite, roughness, pattern.lead)
+        self._set_fields(_triangle=readonly(np.asfortranarray(collocation)), _spread=spread)
         if not self._triangle.diagonal().all():
             raise ValueError("the constraints must determine the plan, got a singular system")
 
@@ -210,8 +215,8 @@ class NewtonSystem(Fields):
         if self._inverse is None or taylor_data.dtype != np.float64:
             return self.coefficients_of(taylor_data)
         offset = taylor_data[self._anchor].copy()
-        for row, position in zip(taylor_data, self._positions, strict=True):
-            if position:
+        for row, order in zip(taylor_data, self._orders, strict=True):
+            if not order:
                 row -= offset
         found: Array = self._inverse @ taylor_data
         found[0] += offset
@@ -321,6 +326,47 @@ class NewtonSystem(Fields):
             out[self.size - 1] += self._fold * out[self.size]
         return out[: self.size]
 
+    def _collocation(self, beyond: Array, pattern: _Pattern) -> Array:
+        """Prescribed Taylor coefficients (nconstraints, size) of every basis function.
+
+        As `_taylor`, by matrices that multiply series by the factors of each pair: fewer
+        steps, for few times.
+
+        Parameters
+        ----------
+        beyond : ndarray, shape (nwaypoints, size)
+            Distances of the waypoints to the nodes.
+        pattern : _Pattern
+            The constraints.
+        """
+        half, n = 0.5 * effective(self.alpha), max(pattern.keys) + 1
+        count, npairs = len(beyond), self.size // 2
+        angles = np.empty((3, npairs, count))  # of both factors of each pair, and their sum
+        np.multiply(beyond[:, : 2 * npairs].T.reshape(npairs, 2, count).swapaxes(0, 1), half or 1.0, out=angles[:2])
+        parts = np.empty((2, npairs, count, 3))  # of q c and of q q
+        np.add(angles[0], angles[1], out=angles[2])
+        if half:
+            cosines, angles = np.cos(angles[1:]), np.sin(angles)
+            np.multiply(angles[0], cosines[0], out=parts[0, ..., 0])
+        else:
+            cosines = np.ones((2, 1, 1))
+            parts[0, ..., 0] = angles[0]
+        np.multiply(angles[0], angles[1], out=parts[1, ..., 0])
+        parts[..., 1], parts[..., 2] = cosines[1], angles[2]
+        factors = (parts.reshape(2, npairs * count, 3) @ _pair_kernel(self.alpha, n - 1)).reshape(
+            2, npairs, count, n, n
+        )
+        series = np.zeros((npairs + 1, count, n, 1))
+        series[0, :, 0] = 1.0
+        for j in range(npairs if self._fold or self.size % 2 else npairs - 1):  # the last product may not be used
+            np.matmul(factors[1, j], series[j], out=series[j + 1])
+        out = np.empty((2 * npairs + 1, count, n))
+        out[::2] = series[..., 0]
+        out[1::2] = (factors[0] @ series[:-1])[..., 0]
+        if self._fold:
+            out[self.size - 1] += self._fold * out[self.size]
+        return np.asarray(out[: self.size, pattern.waypoints, pattern.orders].T)
+
     def taylor_between(self, u: Array, order: int) -> Array:
         r"""As `taylor`, faster at few times, none of which is a node.
 
@@ -372,8 +418,8 @@ class NewtonSystem(Fields):
         By the products of `sampling`; None where they are not resolved.
         """
         if (low, high) not in self._interpolants:
-            found = self._chebyshev(low, high)
-            self._interpolants[low, high] = None if found is None else readonly(in_products(found))
+            found = self._new_interpolant(low, high)
+            self._interpolants[low, high] = None if found is None else readonly(found)
         return self._interpolants[low, high]
 
     @cached_property
@@ -381,23 +427,28 @@ class NewtonSystem(Fields):
         """Interpolants by lowest and highest order."""
         return {}
 
-    def _chebyshev(self, low: int, high: int) -> Array | None:
-        """Chebyshev coefficients of derivatives of the basis on the unit interval; None where they are not resolved."""
+    def _new_interpolant(self, low: int, high: int) -> Array | None:
+        """As `interpolant`, from values at Chebyshev points."""
         # A polynomial is its own interpolant; other functions have more terms. An even number of points avoids the
         # middle of the interval, where a waypoint often is.
         terms = self.size + math.ceil(self.alpha and 10.0 + self.alpha * (2.3 + 0.18 * self.size))
-        u, scale = unit_points(terms + terms % 2 - 1), FACTORIALS[: high + 1, None, None]
-        found = transform(self.taylor_between(u, high)[low:] * scale[low:])
+        count = terms + terms % 2
+        values = self.taylor_between(unit_points(count - 1), high)
+        for order in range(2, high + 1):
+            values[order] *= math.factorial(order)
+        values = values[low:]
         if not self.alpha:
-            return found[..., :terms]
-        sizes = np.abs(found)
-        if not (sizes[..., -2:].max(axis=2) > _RESOLVED * sizes.max(axis=2)).any():
-            return found
+            return values @ products_of_values(count, terms)
+        last = np.abs(values @ last_coefficients(count))
+        means = np.abs(values) @ evenly(count)
+        if (np.maximum(last[..., 0], last[..., 1]) <= _RESOLVED * means).all():
+            return values @ products_of_values(count, count)
 
         def jet(u: Array, order: int) -> Array:
-            return self.taylor(u, order).transpose(1, 0, 2) * scale[: order + 1]
+            return self.taylor(u, order).transpose(1, 0, 2) * FACTORIALS[: order + 1, None, None]
 
-        return chebyshev_proxy(jet, (0.0, 1.0), low, high)
+        found = chebyshev_proxy(jet, (0.0, 1.0), low, high)
+        return None if found is None else in_products(found)
 
     def series(self, coefficients: Array, u: Value, order: int) -> list[list[Value]]:
         """Taylor series of each axis at one normalised time, a number or a symbol."""
@@ -478,30 +529,42 @@ class NewtonSystem(Fields):
         return out[: self.size]
 
     @cached_property
-    def ranges(self) -> tuple[float, ...]:
+    def ranges(self) -> list[float]:
         """Bounds of the ranges of the basis functions from the second on, over the unit interval."""
-        first, second = self._first.tolist(), self._second.tolist()
-        return _ranges(effective(self.alpha), tuple(first), tuple(second))[: self.size - 1]
+        return _ranges(effective(self.alpha), self._nodes.tolist())[: self.size - 1]
 
     @cached_property
     def higher_ranges(self) -> Array:
         """The same from the third function on, as an array."""
         return readonly(np.array(self.ranges[1:]))
 
-    def stays_near(self, coefficients: Array, factor: float) -> bool:
-        """Whether coefficients exclude a range above a multiple of the distance of the first two positions.
+    def stays_near(self, coefficients: Array, factor: float, spans: Callable[[], list[float]]) -> bool:
+        """Whether coefficients exclude ranges above a multiple of those of the positions.
 
-        Only of functions between two waypoints, whose ranges do not depend on the
-        times; otherwise the values of all functions are as fast as their ranges.
+        Only for few waypoints; otherwise values of all functions are as fast as their
+        ranges, and say more.
+
+        Parameters
+        ----------
+        coefficients : ndarray, shape (size, naxes)
+            Coefficients of some axes.
+        factor : float
+            The multiple.
+        spans : callable
+            Returns the ranges of the prescribed positions of these axes; it is not
+            called for two waypoints.
         """
-        if self._fold or self._orders[:2] != (0, 0) or self.waypoint_index.max() > 1:
+        if self._fold or not self._is_short:
             return False
-        first, *others = self.ranges
-        allowed = factor * abs(self._triangle.item(1, 1)) - first
-        for _, slope, *column in coefficients.T.tolist():
-            if not sum([abs(c) * r for c, r in zip(column, others, strict=True)]) <= allowed * abs(slope):
-                return False
-        return True
+        columns, ranges = coefficients.T.tolist(), self.ranges
+        if self._is_short == 2:
+            slope = factor * abs(self._triangle.item(1, 1))
+            allowed = [slope * abs(column[1]) for column in columns]
+        else:
+            allowed = [factor * span for span in spans()]
+        return all(
+            [sum(map(mul, map(abs, column[1:]), ranges)) <= most for column, most in zip(columns, allowed, strict=True)]
+        )
 
     @cached_property
     def amplification(self) -> float:
@@ -592,9 +655,8 @@ def _taylor_scale(duration: float, orders: tuple[int, ...]) -> Array:
     return readonly(scale)
 
 
-@lru_cache(maxsize=256)
-def _ranges(alpha: float, first: tuple[float, ...], second: tuple[float, ...]) -> tuple[float, ...]:
-    """Bounds of the ranges of the basis functions from the second on, from the nodes of each pair.
+def _ranges(alpha: float, nodes: list[float]) -> list[float]:
+    """Bounds of the ranges of the basis functions from the second on, from the nodes.
 
     Between the nodes a and b of a pair the product of both factors is largest at their
     mean, outside at the end that is farther from it. Functions with nodes at the ends
@@ -602,24 +664,35 @@ def _ranges(alpha: float, first: tuple[float, ...], second: tuple[float, ...]) -
     """
     found: list[float] = []
     product, signed, alternate = 1.0, True, True  # signs do not change; each pair before has a node at each end
-    for a, b in zip(first, second, strict=True):
-        mean, apart, alone = 0.5 * (a + b), abs(b - a), max(a, 1.0 - a)
-        far = max(mean, 1.0 - mean)
-        if alpha:
-            alone = 2.0 / alpha * math.sin(min(0.5 * alpha * alone, 0.5 * math.pi))
-            inner = math.cos(0.5 * alpha * apart)
-            pair = 2.0 / alpha**2 * max(1.0 - inner, inner - math.cos(min(alpha * far, math.pi)))
-        else:
-            pair = max(0.25 * apart**2, far**2 - 0.25 * apart**2)
-        at_end = a in (0.0, 1.0)
-        if alternate and at_end and alpha <= math.pi:
+    peaks: dict[tuple[float, float], tuple[float, float]] = {}
+    few = alpha <= math.pi
+    for a, b in zip(nodes[::2], nodes[1::2], strict=False):
+        if (a, b) not in peaks:
+            peaks[a, b] = _pair_peaks(alpha, a, b)
+        alone, pair = peaks[a, b]
+        at_end = few and (a == 0.0 or a == 1.0)
+        if alternate and at_end:
             found.append(_odd_peak(alpha, len(found) // 2))
         else:
-            found.append(product * alone * (1.0 if signed and at_end and alpha <= math.pi else 2.0))
-        alternate = alternate and apart == 1.0
-        product, signed = product * pair, signed and at_end and b in (0.0, 1.0)
+            found.append(product * alone * (1.0 if signed and at_end else 2.0))
+        alternate = alternate and abs(b - a) == 1.0
+        product, signed = product * pair, signed and (a in _ENDS and b in _ENDS)
         found.append(product * (1.0 if signed else 2.0))
-    return tuple(found)
+    return found
+
+
+_ENDS = (0.0, 1.0)
+
+
+def _pair_peaks(alpha: float, a: float, b: float) -> tuple[float, float]:
+    """Maxima of the first factor of a pair of nodes, and of the product of both."""
+    mean, apart, alone = 0.5 * (a + b), abs(b - a), max(a, 1.0 - a)
+    far = max(mean, 1.0 - mean)
+    if not alpha:
+        return alone, max(0.25 * apart**2, far**2 - 0.25 * apart**2)
+    inner = math.cos(0.5 * alpha * apart)
+    pair = 2.0 / alpha**2 * max(1.0 - inner, inner - math.cos(min(alpha * far, math.pi)))
+    return 2.0 / alpha * math.sin(min(0.5 * alpha * alone, 0.5 * math.pi)), pair
 
 
 @lru_cache(maxsize=256)
@@ -649,60 +722,97 @@ def _grid(count: int) -> Array:
     return readonly(np.linspace(0.0, 1.0, count))
 
 
-def _constraints(
-    alpha: float, times: Array, given: tuple[tuple[int, ...], ...], meet: bool
-) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
-    """Waypoint and order of each constraint, in the order of the Newton form.
+class _Pattern(NamedTuple):
+    """Constraints in the order of the Newton form.
 
-    Waypoints are in Leja order: each maximises the product of its distances to
-    the previous ones. Ends that coincide on the circle come first with all their
-    entries, whose number is returned: as their data agree, the divided
-    differences between them are 0 or small, and no others are divided by their
-    distance.
+    Attributes
+    ----------
+    at, keys : tuple of int
+        Waypoint and order of each constraint.
+    waypoints, orders : ndarray of int, shape (nconstraints,)
+        The same as arrays.
+    positions : ndarray, shape (nconstraints, 1)
+        1 for a prescribed position, else 0.
+    anchor : int
+        First prescribed position.
+    hermite : bool
+        Whether no order is left out at any waypoint.
+    lead : int
+        Number of constraints of ends that coincide.
+    is_short : int
+        Number of waypoints if they are few and begin with their positions, else 0.
+    """
+
+    at: tuple[int, ...]
+    keys: tuple[int, ...]
+    waypoints: NDArray[np.intp]
+    orders: NDArray[np.intp]
+    positions: Array
+    anchor: int
+    hermite: bool
+    lead: int
+    is_short: int
+
+
+@lru_cache(maxsize=256)
+def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> _Pattern:
+    """Constraints of waypoints in Leja order; ends that coincide come first with all their entries."""
+    first = _sequence(ordered[:2], given) if meet else []
+    pairs = first + _sequence(ordered[2:] if meet else ordered, given)
+    at, keys = (tuple(column) for column in zip(*pairs, strict=True))
+    orders = np.array(keys, dtype=np.intp)
+    waypoints, positions = np.array(at, dtype=np.intp), (orders == 0).astype(float)[:, None]
+    for array in (orders, waypoints, positions):
+        array.flags.writeable = False
+    hermite = all([own == tuple(range(len(own))) for own in given])
+    number = len(set(at))
+    is_short = number if 2 <= number <= _SHORT and keys[:number] == (0,) * number else 0
+    return _Pattern(at, keys, waypoints, orders, positions, int((orders == 0).argmax()), hermite, len(first), is_short)
+
+
+def _leja(
+    alpha: float, times: list[float], given: tuple[tuple[int, ...], ...], meet: bool
+) -> tuple[tuple[int, ...], bool]:
+    """Waypoints in Leja order, and whether the ends coincide on the circle.
+
+    Each maximises the product of its distances to the previous ones. Ends that
+    coincide come first: as their data agree, the divided differences between them
+    are 0 or small, and no others are divided by their distance.
     """
     used = [i for i, g in enumerate(given) if g]
-    u, half = times[used].tolist(), 0.5 * alpha
+    u, half, sin = [times[i] for i in used], 0.5 * alpha, math.sin
 
     def distances(v: float) -> list[float]:
-        return [abs(math.sin(half * (w - v)) if half else w - v) for w in u]
+        return [abs(sin(half * (w - v))) for w in u] if half else [abs(w - v) for w in u]
 
     product = distances(u[0])
     if meet:
         nearest = min([distances(v)[i] for i, v in enumerate(u[:-1], 1)], default=0.0)
         meet = len(used) > 2 and product[-1] < _MEET * nearest
     chosen = [0]
-    while len(chosen) < len(u):
+    while len(chosen) < len(u) - 1:
         # Rescaled, so that the products do not underflow for many waypoints.
         farthest = len(u) - 1 if meet and len(chosen) == 1 else product.index(max(product))
         scale = product[farthest] or 1.0
         product = [p * (d / scale) for p, d in zip(product, distances(u[farthest]), strict=True)]
         chosen.append(farthest)
-    ordered = [used[i] for i in chosen]
-    if not meet:
-        return *_sequence(ordered, given), 0
-    (first, rank), (others, ranks) = _sequence(ordered[:2], given), _sequence(ordered[2:], given)
-    return np.concatenate([first, others]), np.concatenate([rank, ranks]), len(first)
+    chosen += set(range(len(u))) - set(chosen)
+    return tuple([used[i] for i in chosen]), meet
 
 
-def _sequence(waypoints: list[int], given: tuple[tuple[int, ...], ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _sequence(waypoints: tuple[int, ...], given: tuple[tuple[int, ...], ...]) -> list[tuple[int, int]]:
     """Constraints in rounds through the waypoints, those of each waypoint distributed evenly over all rounds.
 
     Orders increase at each waypoint, as the triangle requires, and at every stage
     the nodes are distributed like all of them. Otherwise waypoints with few
     entries before long jets elsewhere cost four digits.
     """
-    lengths = set(map(len, given))
-    if len(lengths) == 1:  # the same order, computed faster
-        rows = [(i, given[i][turn]) for turn in range(lengths.pop()) for i in waypoints]
-        table = np.array(rows, dtype=np.intp)
-        return table[:, 0], table[:, 1]
     pairs = [
         ((turn + 1) / len(given[i]), rank, i, order)
         for rank, i in enumerate(waypoints)
         for turn, order in enumerate(given[i])
     ]
-    table = np.array([(i, order) for _, _, i, order in sorted(pairs)], dtype=np.intp)
-    return table[:, 0], table[:, 1]
+    return [(i, order) for _, _, i, order in sorted(pairs)]
 
 
 def _spare_nodes(mean: float, count: int) -> Array:
@@ -775,6 +885,20 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: in
             )
         spread = spread + basis[:, count:] @ free
     return np.asfortranarray(triangle), spread
+
+
+@lru_cache(maxsize=256)
+def _pair_kernel(alpha: float, order: int) -> Array:
+    """Multiplication of a Taylor jet by the factors of a pair: shape (2, 3, (order + 1)^2), of q c and of q q.
+
+    From sin a cos b and sin a sin b, cos(a + b) and sin(a + b), with the angles a and b
+    of both factors; from a and a b, 1 and a + b of a polynomial.
+    """
+    alpha = effective(alpha)
+    one, s, v = _kernel(alpha, order).reshape(3, -1)
+    half = 0.5 * alpha or 1.0
+    single = [one / half, s, -half * v if alpha else 0.0 * v]
+    return readonly(np.array([single, [one / half**2, v, s / half]]))
 
 
 @lru_cache(maxsize=256)

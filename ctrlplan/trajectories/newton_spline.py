@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from itertools import pairwise
+from operator import sub
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -62,9 +62,10 @@ class NewtonSpline(WaypointSpline):
     is_linear = True
 
     alpha: float
+    _moments: list[float]
     _options: SplineOptions
     _times: list[float]
-    _relative: Array
+    _relative: tuple[float, ...]
     _apart: Array | None
     _duration: float
     _systems: dict[Kind, NewtonSystem]
@@ -127,7 +128,7 @@ class NewtonSpline(WaypointSpline):
         if not 0.0 < duration < np.inf:
             raise ValueError(f"duration must be finite and above 0, got {times[-1]} s after {start} s")
         same_times = donor is not None and donor._times == times and donor._duration == duration
-        relative = donor._relative if donor and same_times else (np.array(times) - start) / duration
+        relative = donor._relative if donor and same_times else tuple([(t - start) / duration for t in times])
         apart = donor._apart if donor and same_times else _apart(times, relative, duration)
         lent = donor._systems if donor and (same_times or _same_pattern(donor, relative, apart)) else {}
         table, patterns = given_entries(waypoints)
@@ -148,15 +149,14 @@ class NewtonSpline(WaypointSpline):
             labels = donor.labels
         else:
             labels = checked_labels(options.labels or waypoints[0].labels, table.shape[2])
-        if donor is not None and same_times:
-            breakpoints = donor.breakpoints
-        else:
-            breakpoints = readonly(np.array([start, times[-1] if period is None else start + period]))
+        moments = [start, times[-1] if period is None else start + period]
+        breakpoints = donor.breakpoints if donor is not None and same_times else readonly(np.array(moments))
         self._set_fields(
             waypoints=waypoints,
             alpha=alpha,
             labels=labels,
             breakpoints=breakpoints,
+            _moments=moments,
             _options=options,
             _times=times,
             _relative=relative,
@@ -174,7 +174,14 @@ class NewtonSpline(WaypointSpline):
 
     def _check_swing(self) -> None:
         """Warn, unless disabled, if the plan swings far beyond its waypoints."""
-        if not self._options.warn or all([s.stays_near(c, MAXIMUM_SWING) for _, s, c in self._parts]):
+        if not self._options.warn:
+            return
+
+        def spans() -> list[float]:
+            positions = zip(*[w.jet[0].tolist() for w in self.waypoints], strict=True)
+            return [max(own) - min(own) for own in positions]
+
+        if len(self._parts) == 1 and self._parts[0][1].stays_near(self._parts[0][2], MAXIMUM_SWING, spans):
             return
         if len(self._parts) == 1:
             _, system, coefficients = self._parts[0]
@@ -260,8 +267,8 @@ class NewtonSpline(WaypointSpline):
             rows = np.zeros((high - low + 1, self.naxes, max([own.shape[2] for _, own in found])))
             for axes, own in found:
                 rows[:, list(axes), : own.shape[2]] = own
-        powers = self._duration ** -np.arange(low, high + 1.0)
-        return Interpolant.of(rows * powers[:, None, None])
+        powers = np.array([[[self._duration**-k]] for k in range(low, high + 1)])
+        return Interpolant.of(rows * powers)
 
     def _end_jet(self, segment: int, s: float, order: int) -> Array:
         # What a waypoint prescribes is not computed.
@@ -330,13 +337,13 @@ class NewtonSpline(WaypointSpline):
 
 
 def _system(
-    alpha: float, relative: Array, apart: Array | None, kind: Kind, size: int | None, smooth: int
+    alpha: float, relative: tuple[float, ...], apart: Array | None, kind: Kind, size: int | None, smooth: int
 ) -> NewtonSystem:
     """System for a pattern of entries; of few entries that of earlier plans with the same relative times."""
     given, gamma, meet = kind
     if apart is None and (size or sum(map(len, given))) <= _SHARED:
-        return shared_system(alpha, tuple(relative.tolist()), given, gamma, size, smooth, meet)
-    return NewtonSystem(alpha, relative, given, gamma, size, smooth, meet, apart)
+        return shared_system(alpha, relative, given, gamma, size, smooth, meet)
+    return NewtonSystem(alpha, np.array(relative), given, gamma, size, smooth, meet, apart)
 
 
 def _solved(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:
@@ -351,16 +358,16 @@ def _solved(system: NewtonSystem, data: Array, times: list[float], duration: flo
     return found
 
 
-def _apart(times: list[float], relative: Array, duration: float) -> Array | None:
+def _apart(times: list[float], relative: tuple[float, ...], duration: float) -> Array | None:
     """Differences of the normalised times, if those of the rounded times would lose digits."""
-    if min([after - before for before, after in pairwise(relative.tolist())], default=1.0) > 1e-4:
+    if min(map(sub, relative[1:], relative), default=1.0) > 1e-4:
         return None
     return np.subtract.outer(times, times) / duration
 
 
-def _same_pattern(donor: NewtonSpline, relative: Array, apart: Array | None) -> bool:
+def _same_pattern(donor: NewtonSpline, relative: tuple[float, ...], apart: Array | None) -> bool:
     """Whether the systems of another plan are valid for these times."""
-    if not np.array_equal(donor._relative, relative):
+    if donor._relative != relative:
         return False
     return apart is None or (donor._apart is not None and np.array_equal(donor._apart, apart))
 
@@ -378,8 +385,8 @@ def _size(alpha: float, count: int, degree: int | None) -> int | None:
 def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
     """Entries (waypoint, order, axis), and the orders prescribed at each waypoint for each axis."""
     jets = [w.jet for w in waypoints]
-    sizes = [len(j) for j in jets]
-    if min(sizes) == max(sizes) and all([w.complete for w in waypoints]):
+    sizes = list(map(len, jets))
+    if len(set(sizes)) == 1 and all([w.complete for w in waypoints]):
         return np.array(jets), [(tuple(range(sizes[0])),) * len(sizes)] * waypoints[0].naxes
     table = np.full((len(jets), max(sizes), jets[0].shape[1]), np.nan)
     for row, jet in zip(table, jets, strict=True):

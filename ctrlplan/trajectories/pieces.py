@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from functools import cached_property
@@ -155,7 +156,7 @@ class Form:
             else:
                 found = system.coefficients_of_many(data.reshape(len(data), -1))
                 found = np.ascontiguousarray(found).reshape(system.size, *data.shape[1:])
-            if not np.isfinite(found.sum()) and not np.isfinite(found).all():
+            if not math.isfinite(np.add.reduce(found, axis=None)) and not np.isfinite(found).all():
                 wrong = self.kind.first + int(np.flatnonzero(~np.isfinite(found).all(axis=(0, 1)))[0])
                 raise ValueError(
                     "coefficients must stay within floating point, got an overflow from waypoint entries of up to "
@@ -186,22 +187,23 @@ class Form:
         return np.asarray(times[1:] - times[:-1])
 
     @cached_property
-    def _factors(self) -> list[NDArray[Any]]:
+    def _factors(self) -> NDArray[Any]:
         return self._factors_of(self.durations)
 
-    def _factors_of(self, durations: NDArray[Any]) -> list[NDArray[Any]]:
-        """Factors from derivatives to Taylor coefficients in relative time, by order."""
-        powers = [np.ones_like(durations)]
+    def _factors_of(self, durations: NDArray[Any]) -> NDArray[Any]:
+        """Factors (norders, nsegments) from derivatives to Taylor coefficients in relative time."""
+        powers = np.ones((1 + int(self.system.order_index.max()), durations.size), dtype=durations.dtype)
         with np.errstate(over="ignore", under="ignore"):
-            while len(powers) <= self.system.order_index.max():
-                powers.append(powers[-1] * durations)
+            for before, power in itertools.pairwise(powers):
+                np.multiply(before, durations, out=power)
         if not (powers[-1].min() > _SMALLEST and powers[-1].max() < np.inf):
             wrong = durations[~((powers[-1] > _SMALLEST) & (powers[-1] < np.inf))]
             raise ValueError(
                 f"powers of the duration must stay within floating point, got {wrong[0]:g} s to the power "
                 f"{len(powers) - 1}; choose another unit of time"
             )
-        return [power / factorial for power, factorial in zip(powers, FACTORIALS.tolist(), strict=False)]
+        powers /= FACTORIALS[: len(powers), None]
+        return powers
 
     def _taylor_data(self, rows: NDArray[Any]) -> NDArray[Any]:
         """Taylor data (nentries, naxes, nsegments) in relative time, in the order of the system."""
@@ -209,9 +211,22 @@ class Form:
         factors = self._factors if rows.dtype == float else self._factors_of(self._durations(rows.dtype))
         count = self.kind.last - first
         data = np.empty((system.order_index.size, len(rows), count), dtype=rows.dtype)
+        if self._in_turn:  # both ends of all orders together
+            by_order = data.reshape(-1, 2, len(rows), count)
+            for end in (0, 1):
+                own = rows[:, : len(by_order), first + end : first + end + count].swapaxes(0, 1)
+                np.multiply(own, factors[: len(by_order), None], out=by_order[:, end])
+            return data
         for row, waypoint, order in zip(data, system.waypoint_index.tolist(), system.order_index.tolist(), strict=True):
             np.multiply(rows[:, order, first + waypoint : first + waypoint + count], factors[order], out=row)
         return data
+
+    @cached_property
+    def _in_turn(self) -> bool:
+        """Whether entries are ordered by their order, those of both ends in turn."""
+        every = range(len(self.kind.ends[0]))
+        places = zip(self.system.waypoint_index.tolist(), self.system.order_index.tolist(), strict=True)
+        return list(places) == [(end, order) for order in every for end in (0, 1)]
 
     def _carefully_solved(self, rows: Array, data: Array) -> Array:
         """Coefficients (size, naxes, nsegments), each segment with a check of the rounding errors."""

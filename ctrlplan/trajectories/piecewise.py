@@ -23,7 +23,7 @@ from ctrlplan.trajectories.pieces import Pieces, Run, scales
 from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
 from ctrlplan.trajectories.piecewise_fit import Frame
 from ctrlplan.trajectories.polynomial import PolySpline
-from ctrlplan.trajectories.sampling import FEW, sample_segments
+from ctrlplan.trajectories.sampling import FEW, are_finite, place_entries, sample_segments
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
 from ctrlplan.trajectories.waypoint import Entries, Waypoint
@@ -250,7 +250,7 @@ class PiecewiseSpline(WaypointSpline):
     ) -> None:
         """Set all fields but the waypoints; what does not depend on values is taken from a `donor` at equal times."""
         unknown = np.isnan(entries.rows)
-        if donor is not None and np.array_equal(unknown, donor._frame.unknown):
+        if donor is not None and donor._frame.has(unknown):
             frame, names = donor._frame, donor.labels
         else:
             frame = Frame(alpha, entries.times, period, unknown)
@@ -392,7 +392,7 @@ class PiecewiseSpline(WaypointSpline):
         if self.alpha > math.pi:
             return False
         positions = self._entries.rows[:, 0]
-        lowest, highest = positions.min(axis=1), positions.max(axis=1)
+        lowest, highest = np.minimum.reduce(positions, axis=1), np.maximum.reduce(positions, axis=1)
         allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (highest - lowest)
         for pieces in self._pieces:
             axes = list(pieces.axes)
@@ -403,10 +403,10 @@ class PiecewiseSpline(WaypointSpline):
                 if not weights.size:
                     continue
                 sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
-                own = (weights @ sizes).reshape(len(axes), -1)
-                if (own.max(axis=1) <= allowed[axes]).all():
+                near = (weights @ sizes).reshape(len(axes), -1) <= allowed[axes, None]
+                if near.all():
                     continue
-                low, high = _range(run, np.flatnonzero(~(own <= allowed[axes, None]).all(axis=0)))
+                low, high = _range(run, np.flatnonzero(~near.all(axis=0)))
                 if not ((low >= (lowest - allowed)[axes]) & (high <= (highest + allowed)[axes])).all():
                     return False
         return True
@@ -420,10 +420,12 @@ class PiecewiseSpline(WaypointSpline):
         duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
         u, scale = s / duration, derivative_scale(duration, order)[:, None, None]
         if len(self._pieces) == 1:
-            return self._pieces[0].jet(segment, u, order) * scale
-        out = np.empty((order + 1, self.naxes, u.size))
-        for pieces in self._pieces:
-            out[:, list(pieces.axes)] = pieces.jet(segment, u, order) * scale
+            out = self._pieces[0].jet(segment, u, order) * scale
+        else:
+            out = np.empty((order + 1, self.naxes, u.size))
+            for pieces in self._pieces:
+                out[:, list(pieces.axes)] = pieces.jet(segment, u, order) * scale
+        self._place_filled(np.array([segment]).repeat(s.size), s, 0, out)
         return out
 
     def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
@@ -446,11 +448,21 @@ class PiecewiseSpline(WaypointSpline):
         h = self._durations[segments]
         u, scale = s / h, scales(h, high)[low:, None]
         if len(self._pieces) == 1:
-            return self._pieces[0].jets(segments, u, high)[low:] * scale
-        out = np.empty((high - low + 1, self.naxes, s.size))
-        for pieces in self._pieces:
-            out[:, list(pieces.axes)] = pieces.jets(segments, u, high)[low:] * scale
+            out = self._pieces[0].jets(segments, u, high)[low:] * scale
+        else:
+            out = np.empty((high - low + 1, self.naxes, s.size))
+            for pieces in self._pieces:
+                out[:, list(pieces.axes)] = pieces.jets(segments, u, high)[low:] * scale
+        self._place_filled(segments, s, low, out)
         return out
+
+    def _place_filled(self, segments: NDArray[np.intp], s: Array, low: int, out: Array) -> None:
+        """Replace derivatives, from an order on, at ends of segments: they are the entries there in every bit."""
+        entries = self._filled[:, low : low + len(out)].transpose(2, 1, 0)
+        for end, moments in enumerate((0.0, self._durations[segments])):
+            where = (s == moments).nonzero()[0]
+            if where.size:
+                place_entries(entries[segments[where] + end], where, out)
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         if t.size == 1:
@@ -460,7 +472,8 @@ class PiecewiseSpline(WaypointSpline):
         if self._is_extreme(high) or not t.size:
             return super()._sample(t, low, high, left)
         times = self.breakpoints
-        first, last = float(t.min()), float(t.max())
+        is_sorted = bool((t[1:] >= t[:-1]).all())
+        first, last = (t.item(0), t.item(-1)) if is_sorted else (float(t.min()), float(t.max()))
         if not (first > times[0] if left else first >= times[0]) or not last <= times[-1]:
             inside = (t > times[0] if left else t >= times[0]) & (t <= times[-1])
             if np.count_nonzero(inside) <= _FEW:
@@ -470,37 +483,40 @@ class PiecewiseSpline(WaypointSpline):
             out[:, :, ~inside] = super()._sample(t[~inside], low, high, left)
             return out
         with np.errstate(over="ignore", invalid="ignore"):
-            out, finite = self._sample_inside(t, low, high, left)
+            out, finite = self._sample_inside(t, is_sorted, low, high, left)
         return out if finite or np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
-    def _sample_inside(self, t: Array, low: int, high: int, left: bool) -> tuple[Array, bool]:
+    def _sample_inside(self, t: Array, is_sorted: bool, low: int, high: int, left: bool) -> tuple[Array, bool]:
         """Derivatives low to high at times of the plan, and whether they are certainly finite."""
         times = self.breakpoints
         if t.size > FEW and all([pieces.is_resolved(low, high) for pieces in self._pieces]):
             out = np.empty((high - low + 1, self.naxes, t.size))
             entries = self._filled[:, low : high + 1].transpose(2, 1, 0)
-            known = self._known_rows(low, high)
-            finite = sample_segments(
-                times, lambda own: self._rows_of(own, low, high) if known is None else known[own], entries, t, left, out
-            )
-            return out, finite
+
+            def rows_of(segments: NDArray[np.intp]) -> tuple[Array, bool]:
+                if times.size > _FEW:
+                    rows = self._rows_of(segments, low, high)
+                    return rows, are_finite(rows)
+                rows, finite = self._known_rows(low, high)
+                return (rows if segments.size == len(rows) else rows[segments]), finite
+
+            return out, sample_segments(times, rows_of, entries, t, is_sorted, left, out)
         segments = times[1:-1].searchsorted(t, side="left" if left else "right")
         touched = int(np.count_nonzero(segments[1:] != segments[:-1])) + 1
         if touched <= _FEW:
             return super()._sample(t, low, high, left), True
         return self._jets(segments, t - times[segments], low, high), False
 
-    def _known_rows(self, low: int, high: int) -> Array | None:
-        """Rows of interpolants of all segments, kept with a plan of few segments; None for others."""
-        if self._durations.size > _FEW:
-            return None
+    def _known_rows(self, low: int, high: int) -> tuple[Array, bool]:
+        """Rows of interpolants of all segments of a plan of few, which are kept, and whether they are finite."""
         if (low, high) not in self._rows_by_orders:
-            self._rows_by_orders[low, high] = readonly(self._rows_of(np.arange(self._durations.size), low, high))
+            rows = readonly(self._rows_of(np.arange(self._durations.size), low, high))
+            self._rows_by_orders[low, high] = rows, are_finite(rows)
         return self._rows_by_orders[low, high]
 
     @cached_property
-    def _rows_by_orders(self) -> dict[tuple[int, int], Array]:
-        """Rows of interpolants by lowest and highest order."""
+    def _rows_by_orders(self) -> dict[tuple[int, int], tuple[Array, bool]]:
+        """The same by lowest and highest order."""
         return {}
 
     def _rows_of(self, segments: NDArray[np.intp], low: int, high: int) -> Array:

@@ -43,6 +43,14 @@ class Frame:
         _check_durations(times, period)
         self.breakpoints = times if period is None else readonly(np.append(times, times[0] + period))
 
+    def has(self, unknown: NDArray[np.bool_]) -> bool:
+        """Whether entries have the same shape, and the same of them are free."""
+        return unknown.shape == self.unknown.shape and unknown.tobytes() == self._unknown_bytes
+
+    @cached_property
+    def _unknown_bytes(self) -> bytes:
+        return self.unknown.tobytes()
+
     def fitted(self, rows: Array) -> tuple[Array, tuple[Pieces, ...]]:
         """Entries with the free ones of inner waypoints filled in, and the functions of all segments.
 
@@ -114,21 +122,25 @@ class _Group:
         own: NDArray[Any] = rows
         decimals = None
         if self.free is not None:
-            values, places = self.free.solve(rows), self.free.pattern.places
+            values, pattern = self.free.solve(rows), self.free.pattern
             if values.dtype == object:
-                decimals = _placed(rows.astype(object), places, values)
-                values = rounded(values, self.free.pattern.alpha)
-            own = _placed(rows.astype(values.dtype), places, values)
+                decimals = _placed(rows.astype(object), pattern, values)
+                values = rounded(values, pattern.alpha)
+            own = _placed(rows.astype(values.dtype), pattern, values)
         if self.closed:
             own = np.concatenate([own, own[:, :, :1]], axis=2)
             decimals = None if decimals is None else np.concatenate([decimals, decimals[:, :, :1]], axis=2)
         return own, decimals
 
 
-def _placed(rows: NDArray[Any], places: NDArray[np.intp], values: NDArray[Any]) -> NDArray[Any]:
-    """Entries with some of each axis replaced, in place."""
+def _placed(rows: NDArray[Any], pattern: FreePattern, values: NDArray[Any]) -> NDArray[Any]:
+    """Entries with the free ones of each axis replaced, in place."""
+    if pattern.lowest is not None:
+        inner = rows[:, pattern.lowest :, 1:-1]
+        inner[...] = values.reshape(len(rows), inner.shape[2], inner.shape[1]).swapaxes(1, 2)
+        return rows
     rows = np.ascontiguousarray(rows)
-    rows.reshape(len(rows), -1)[:, places] = values
+    rows.reshape(len(rows), -1)[:, pattern.places] = values
     return rows
 
 
@@ -146,15 +158,12 @@ def alike(known: NDArray[np.bool_]) -> list[tuple[int, ...]]:
 
 def _check_durations(times: Array, period: float | None) -> None:
     """Raise if a duration overflows, or if waypoints do not fit into a period."""
-    if period is not None and times[-1] >= times[0] + period:
+    start, last = float(times[0]), float(times[-1])
+    end = last if period is None else start + period
+    if not end - start < np.inf:
+        raise ValueError(f"duration must be finite and above 0, got {end} s after {start} s")
+    if period is not None and last >= end:
         raise ValueError(
             f"waypoints of a cyclic plan must lie within one period of {period:g} s from the first, "
-            f"got waypoints[{times.size - 1}].time = {times[-1]}"
+            f"got waypoints[{times.size - 1}].time = {last}"
         )
-    if float(times[-1]) - float(times[0]) < np.inf:
-        return
-    with np.errstate(over="ignore"):
-        far = np.flatnonzero(~np.isfinite(np.diff(times)))
-    if far.size:
-        start, end = times[far[0] : far[0] + 2].tolist()
-        raise ValueError(f"duration must be finite and above 0, got {end} s after {start} s")

@@ -74,6 +74,8 @@ class PiecewisePolynomial(Trajectory):
             raise ValueError(
                 f"breakpoints must be two or more finite times that increase strictly, got {times.tolist()!r:.200}"
             )
+        if not float(times[-1]) - float(times[0]) < np.inf:
+            raise ValueError(f"duration must be finite, got {times[-1]} s after {times[0]} s")
         if table.ndim != 3 or table.shape[1] != times.size - 1 or not table.size or len(table) > MAXIMUM + 1:
             raise ValueError(
                 f"coefficients must have shape (degree + 1, {times.size - 1}, naxes) and a degree of at most "

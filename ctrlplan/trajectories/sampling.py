@@ -21,14 +21,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.trajectories.chebyshev import transform
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ _SHORT = 14
 _MAX_TERMS = 24
 _PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
 _CHUNK = 4104  # the functions stay in the second cache; no power of two, to avoid conflicts between rows
-_SPARSE = 32  # number of times per segment from which a matrix product for each segment is faster
+_SPARSE = 48  # number of times per segment from which a matrix product for each segment is faster
 _BLOCK = 16 * _CHUNK  # number of times that are grouped together
 _LARGEST = 2.0**20  # bound of all functions of the bases
 
@@ -70,7 +71,27 @@ class Interpolant:
     def of(cls, coefficients: Array) -> Interpolant:
         """Interpolants from coefficients of products (norders, naxes, size)."""
         rows = coefficients.reshape(-1, coefficients.shape[2])
-        return cls(readonly(rows), _are_finite(rows))
+        return cls(readonly(rows), are_finite(rows))
+
+
+class Part(NamedTuple):
+    """Consecutive times of one segment.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (norders * naxes, size)
+        Interpolants on the segment.
+    first, last : int
+        First time, and the one after the last.
+    start, duration : float
+        Of the segment [s].
+    """
+
+    rows: Array
+    first: int
+    last: int
+    start: float
+    duration: float
 
 
 def sample(
@@ -105,15 +126,16 @@ def sample(
     if interpolant is None:
         _sample_chunks(jet, t, orders, out)
         return False
-    evaluate([(interpolant.rows, 0, t.size)], t, duration, out)
+    evaluate([Part(interpolant.rows, 0, t.size, 0.0, duration)], t, out)
     return interpolant.is_finite
 
 
 def sample_segments(
     times: Array,
-    rows_of: Callable[[NDArray[np.intp]], Array],
+    rows_of: Callable[[NDArray[np.intp]], tuple[Array, bool]],
     entries: Array,
     t: Array,
+    is_sorted: bool,
     left: bool,
     out: Array,
 ) -> bool:
@@ -125,23 +147,24 @@ def sample_segments(
         Breakpoints [s].
     rows_of : callable
         Maps numbers of segments (n,) to the rows (n, norders * naxes, size) of their
-        interpolants.
+        interpolants, and to whether these are certainly finite.
     entries : ndarray, shape (nsegments + 1, k, naxes)
         Lowest derivatives at the breakpoints, as far as they are prescribed there;
         others are nan. At most `norders`.
     t : ndarray, shape (ntime,)
         Times [s], from the first breakpoint to the last.
+    is_sorted : bool
+        Whether no time is below the one before.
     left : bool
         Whether breakpoints belong to the segment that ends there.
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
     """
-    is_sorted, finite = bool((t[1:] >= t[:-1]).all()), True
+    finite = True
     for begin in range(0, t.size, _BLOCK):
         part, place = t[begin : begin + _BLOCK], out[:, :, begin : begin + _BLOCK]
         if is_sorted:
-            groups = _groups_of_sorted(times, part, left)
-            finite &= _sample_grouped(times, rows_of, entries, part, left, *groups, place)
+            finite &= _sample_sorted_block(times, rows_of, entries, part, left, place)
         else:
             segments = _segments_of(times, part, left)
             order = segments.astype(np.uint16 if times.size < 2**16 else np.intp).argsort(kind="stable")
@@ -159,20 +182,40 @@ def _segments_of(times: Array, t: Array, left: bool) -> NDArray[np.intp]:
     return np.asarray(found)
 
 
-def _groups_of_sorted(times: Array, t: Array, left: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Segments of sorted times, and the number of times in each."""
+def _sample_sorted_block(
+    times: Array,
+    rows_of: Callable[[NDArray[np.intp]], tuple[Array, bool]],
+    entries: Array,
+    t: Array,
+    left: bool,
+    out: Array,
+) -> bool:
+    """As `sample_segments`, at sorted times."""
     first, last = _segments_of(times, t[[0, -1]], left).tolist()
-    bounds = np.empty(last - first + 2, dtype=np.intp)
+    moments = times[first : last + 2]
+    low, high = t.searchsorted(moments, side="left"), t.searchsorted(moments, side="right")
+    equal = [(i, k) for k, own in enumerate(zip(low.tolist(), high.tolist(), strict=True), first) for i in range(*own)]
+    bounds = high if left else low
     bounds[0], bounds[-1] = 0, t.size
-    bounds[1:-1] = t.searchsorted(times[first + 1 : last + 1], side="right" if left else "left")
-    counts = bounds[1:] - bounds[:-1]
-    used = counts.nonzero()[0]
-    return used + first, counts[used]
+    if t.size < _SPARSE * (last + 1 - first):
+        counts = bounds[1:] - bounds[:-1]
+        used = counts.nonzero()[0]
+        return _sample_grouped(times, rows_of, entries, t, left, used + first, counts[used], out)
+    rows, finite = rows_of(np.arange(first, last + 1))
+    ends, starts = bounds.tolist(), moments.tolist()
+    spans = zip(rows, ends, ends[1:], starts, starts[1:], strict=False)
+    evaluate(
+        [Part(own, begin, end, start, stop - start) for own, begin, end, start, stop in spans if begin < end], t, out
+    )
+    if equal:
+        where, at = np.array(equal).T
+        place_entries(entries[at], where, out)
+    return finite
 
 
 def _sample_grouped(
     times: Array,
-    rows_of: Callable[[NDArray[np.intp]], Array],
+    rows_of: Callable[[NDArray[np.intp]], tuple[Array, bool]],
     entries: Array,
     t: Array,
     left: bool,
@@ -181,32 +224,32 @@ def _sample_grouped(
     out: Array,
 ) -> bool:
     """As `sample_segments`, at times that are grouped by segment."""
+    rows, finite = rows_of(segments)
     starts, ends = times[segments], times[segments + 1]
-    origin = starts.repeat(counts)
-    bounds = counts.cumsum().tolist()
-    rows, durations = rows_of(segments), (ends - starts).repeat(counts)
+    durations = ends - starts
     if t.size < _SPARSE * segments.size:
-        _evaluate_each(rows, np.arange(segments.size).repeat(counts), t - origin, durations, out)
+        index = np.arange(segments.size).repeat(counts)
+        _evaluate_each(rows, index, t - starts[index], durations[index], out)
     else:
-        evaluate(zip(rows, [0, *bounds[:-1]], bounds, strict=True), t - origin, durations, out)
-    where = (t == (ends.repeat(counts) if left else origin)).nonzero()[0]
-    if where.size:
-        _place_entries(entries[segments.repeat(counts)[where] + left], where, out)
+        bounds = [0, *counts.cumsum().tolist()]
+        evaluate(list(map(Part, rows, bounds, bounds[1:], starts.tolist(), durations.tolist())), t, out)
+    where = (t == (ends if left else starts).repeat(counts)).nonzero()[0]
+    at = segments.repeat(counts)[where] + left
     if segments[-1] == times.size - 2 and not left:  # the end belongs to the last segment
-        where = (t[bounds[-1] - counts[-1] :] == times[-1]).nonzero()[0] + (bounds[-1] - counts[-1])
-        if where.size:
-            _place_entries(entries[[-1]], where, out)
-    return _are_finite(rows)
+        more = (t[-counts[-1] :] == ends[-1]).nonzero()[0] + (t.size - counts[-1])
+        where, at = np.append(where, more), np.append(at, np.full(more.size, times.size - 1))
+    if where.size:
+        place_entries(entries[at], where, out)
+    return finite
 
 
-def _place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
+def place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
     """Replace the lowest derivatives at some times by those that are known, (ntimes, k, naxes)."""
     rows, place = known.transpose(1, 2, 0), out[: known.shape[1]]
-    free = np.isnan(rows)
-    place[:, :, where] = np.where(free, place[:, :, where], rows) if free.any() else rows
+    place[:, :, where] = np.where(np.isnan(rows), place[:, :, where], rows) if np.isnan(known).any() else rows
 
 
-def _are_finite(coefficients: Array) -> bool:
+def are_finite(coefficients: Array) -> bool:
     """Whether coefficients exclude values that are not finite."""
     return math.isfinite(_LARGEST * float(np.add.reduce(np.abs(coefficients), axis=None)))
 
@@ -216,40 +259,46 @@ def in_products(coefficients: Array) -> Array:
     return np.asarray(coefficients @ _products_of_chebyshev(coefficients.shape[-1]))
 
 
-def evaluate(parts: Iterable[tuple[Array, int, int]], t: Array, duration: Array | float, out: Array) -> None:
+@lru_cache(maxsize=64)
+def products_of_values(count: int, terms: int) -> Array:
+    """Matrix (count, terms) from values at Chebyshev points to the coefficients of the first products."""
+    return readonly(in_products(transform(np.eye(count))[:, :terms]))
+
+
+def evaluate(parts: Sequence[Part], t: Array, out: Array) -> None:
     """Values of interpolants.
 
     Parameters
     ----------
-    parts : iterable of (ndarray, int, int)
-        Rows of an interpolant, and the first time and the one after the last at
-        which it is evaluated; increasing.
+    parts : sequence of Part
+        All times in turn.
     t : ndarray, shape (ntime,)
-        Times [s] since the start of their segments.
-    duration : float or ndarray, shape (ntime,)
-        Durations [s] of these segments.
+        Times [s].
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
     """
     target = out.reshape(-1, t.size)  # a view
-    left = list(parts)[::-1]
-    size = max((rows.shape[1] for rows, _, _ in left), default=1)
-    basis = np.empty((max(size, 2), min(_CHUNK, t.size)))
+    basis = np.empty((max([2, *[part.rows.shape[1] for part in parts]]), min(_CHUNK, t.size)))
     basis[0] = 1.0
-    quarter = 0.25 * duration
+    place = 0
     for begin in range(0, t.size, _CHUNK):
         end = min(begin + _CHUNK, t.size)
         functions = basis[:, : end - begin]
-        _products(t[begin:end], quarter if isinstance(quarter, float) else quarter[begin:end], functions)
-        while left and left[-1][1] < end:
-            rows, first, last = left[-1]
-            step = max(1, _PRODUCT // rows.size)
-            for low in range(max(first, begin), min(last, end), step):
-                high = min(low + step, last, end)
-                np.matmul(rows, functions[: rows.shape[1], low - begin : high - begin], out=target[:, low:high])
+        inside = []
+        while place < len(parts) and parts[place].first < end:
+            rows, first, last, start, duration = parts[place]
+            low, high = max(first, begin), min(last, end)
+            _scale(t[low:high], start, 0.25 * duration, functions[1, low - begin : high - begin])
+            inside.append((rows, low, high))
             if last > end:
                 break
-            left.pop()
+            place += 1
+        _fill(functions)
+        for rows, first, last in inside:
+            step = max(1, _PRODUCT // rows.size)
+            for low in range(first, last, step):
+                high = min(low + step, last)
+                np.matmul(rows, functions[: rows.shape[1], low - begin : high - begin], out=target[:, low:high])
 
 
 def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Array, out: Array) -> None:
@@ -268,15 +317,22 @@ def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Arr
     for begin in range(0, t.size, _CHUNK):
         end = min(begin + _CHUNK, t.size)
         functions = basis[:, : end - begin]
-        _products(t[begin:end], 0.25 * duration[begin:end], functions)
+        _scale(t[begin:end], 0.0, 0.25 * duration[begin:end], functions[1])
+        _fill(functions)
         used = functions[: rows.shape[2]].T[:, :, None]
         target[:, begin:end] = (rows[index[begin:end]] @ used)[:, :, 0].T
 
 
-def _products(t: Array, quarter: Array | float, functions: Array) -> None:
-    """Fill the basis (size, ntime) at times since the start, from quarters of the durations; the first one is 1."""
-    np.subtract(t, 2.0 * quarter, out=functions[1])
-    functions[1] /= quarter
+def _scale(t: Array, start: float, quarter: Array | float, out: Array) -> None:
+    """Replace by times relative to the middle of their segments, from -2 to 2."""
+    if start:
+        t = np.subtract(t, start, out)
+    np.subtract(t, 2.0 * quarter, out)
+    np.divide(out, quarter, out)
+
+
+def _fill(functions: Array) -> None:
+    """Fill the basis (size, ntime) from its first two functions, 1 and the scaled time."""
     top, size = 1, len(functions)
     while 2 * top < size:
         square = functions[2 * top]
@@ -387,7 +443,7 @@ def _sample_uniform(
     finite = True
     for row in range(norders):
         table = np.ascontiguousarray(np.moveaxis(jets[low + row : low + row + terms], 0, -1) * scale)
-        finite &= _are_finite(table)
+        finite &= are_finite(table)
         for axis in range(naxes):
             whole = out[row, axis, :main].reshape(ncells, cell)
             for begin in range(0, ncells, block):
@@ -418,7 +474,7 @@ def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, te
             powers[1] /= radius
             _powers(powers)
             np.matmul(table[k], powers[:terms], out=flat[:, begin:end])
-    return _are_finite(table)
+    return are_finite(table)
 
 
 def _powers(functions: Array) -> None:

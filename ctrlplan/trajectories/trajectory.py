@@ -1112,10 +1112,9 @@ class Trajectory(Displayed, Fields, ABC):
         """Derivatives low to high, shape (high - low + 1, naxes, ntime)."""
         if self.in_batches:
             return _sampling.sample_in_batches(self, t, low, high, left)
-        nsegments = self.breakpoints.size - 1
-        if nsegments == 1 and not left and t.size and t.min() >= self.breakpoints[0] and t.max() <= self.breakpoints[1]:
-            origin = self.breakpoints[0]
-            return self._sample_segment(0, t - origin if origin else t, low, high)
+        moments, nsegments = self._moments, self.breakpoints.size - 1
+        if nsegments == 1 and not left and t.size and t.min() >= moments[0] and t.max() <= moments[1]:
+            return self._sample_segment(0, t - moments[0] if moments[0] else t, low, high)
         segments = np.searchsorted(self.breakpoints, t, side="left" if left else "right") - 1
         if nsegments and not left:
             segments[t == self.breakpoints[-1]] = nsegments - 1
@@ -1141,8 +1140,7 @@ class Trajectory(Displayed, Fields, ABC):
 
     def _sample_segment(self, segment: int, s: Array, low: int, high: int, out: Array | None = None) -> Array:
         """Derivatives low to high of a segment, in a part of the result if it is given."""
-        duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
-        if abs(math.log10(duration)) * high > 200.0:
+        if abs(math.log10(self._length(segment))) * high > 200.0:
             return _placed(self._extreme_jet(segment, s, low, high), out)
         with np.errstate(over="ignore", invalid="ignore"):
             if s.size <= _sampling.FEW or not self.naxes:
@@ -1165,18 +1163,24 @@ class Trajectory(Displayed, Fields, ABC):
         def jet(u: Array, order: int) -> Array:
             return self.segment_jet(segment, u, order)
 
-        high = low + len(out) - 1
-        length = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
-        finite = _sampling.sample(jet, self._interpolant(segment, low, high), length, s, (low, high), out)
+        orders = low, low + len(out) - 1
+        finite = _sampling.sample(jet, self._interpolant(segment, *orders), self._length(segment), s, orders, out)
         self._place_ends(segment, s, low, out)
         return finite
 
     def _place_ends(self, segment: int, s: Array, low: int, out: Array) -> None:
         """Replace derivatives at the ends of a segment: they are the entries of waypoints in every bit."""
-        for end in (0.0, float(self.breakpoints[segment + 1] - self.breakpoints[segment])):
+        for end in (0.0, self._length(segment)):
             where = (s == end).nonzero()[0]
-            if where.size:
+            if where.size == 1:
+                out[:, :, where.item()] = self._end_jet(segment, end, low + len(out) - 1)[low:]
+            elif where.size:
                 out[:, :, where] = self._end_jet(segment, end, low + len(out) - 1)[low:, :, None]
+
+    def _length(self, segment: int) -> float:
+        """Duration of a segment [s]."""
+        moments = self._moments
+        return moments[segment + 1] - moments[segment]
 
     def _interpolant(self, segment: int, low: int, high: int) -> _sampling.Interpolant | None:
         """Interpolants of derivatives low to high on a segment; None where they are not resolved."""
@@ -1203,8 +1207,8 @@ class Trajectory(Displayed, Fields, ABC):
 
     def _new_interpolant(self, segment: int, low: int, high: int) -> _sampling.Interpolant | None:
         """As `_interpolant`, from values of the segment."""
-        length = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
-        found = chebyshev_proxy(lambda u, order: self.segment_jet(segment, u, order), (0.0, length), low, high)
+        interval = 0.0, self._length(segment)
+        found = chebyshev_proxy(lambda u, order: self.segment_jet(segment, u, order), interval, low, high)
         return None if found is None else _sampling.Interpolant.of(_sampling.in_products(found))
 
     def _extreme_jet(self, segment: int, s: Array, low: int, high: int) -> Array:

@@ -92,7 +92,8 @@ class TrigSpline(NewtonSpline):
         chosen = SplineOptions(
             labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), warn=warn
         )
-        self._fit(points, chosen_alpha(alpha, points, type(self), **chosen.given()), chosen)
+        options = chosen.given() if isinstance(alpha, str) else {}
+        self._fit(points, chosen_alpha(alpha, points, type(self), **options), chosen)
         self._check_swing()
 
     @classmethod

@@ -50,6 +50,10 @@ class Waypoint(Displayed, Fields):
         If the time is not finite, an entry is infinite, or the numbers of axes
         of the entries differ.
 
+    Notes
+    -----
+    Waypoints are equal if their times, labels and prescribed entries are equal.
+
     Examples
     --------
     >>> Waypoint(6.0, [5.0, 5.0], [1.0, -1.0], 0).jet
@@ -180,6 +184,14 @@ class Waypoint(Displayed, Fields):
     def _entry(self, order: int) -> Array:
         return self.jet[order] if order < len(self.jet) else np.full(self.naxes, np.nan)
 
+    @property
+    def _shortest_jet(self) -> Array:
+        """The jet without the orders above the highest one that is prescribed: these are free whether given or not."""
+        if self.complete:
+            return self.jet
+        known = np.flatnonzero(~np.isnan(self.jet).all(axis=1))
+        return self.jet[: 1 + int(known[-1]) if known.size else 1]
+
     def scaled(self, time: float, rate: float) -> Waypoint:
         """Same point at another time, with scaled derivatives."""
         moved = times_powers(self.jet, rate, np.arange(len(self.jet))[:, None])
@@ -191,7 +203,7 @@ class Waypoint(Displayed, Fields):
 
     def to_dict(self) -> Data:
         """Plain data: time, and jet by order and axis (None if free)."""
-        jet = [[None if v != v else v for v in row] for row in self.jet.tolist()]
+        jet = [[None if v != v else v for v in row] for row in self._shortest_jet.tolist()]
         data: Data = {"time": self.time, "jet": jet}
         if self.labels is not None:
             data["labels"] = list(self.labels)
@@ -213,10 +225,10 @@ class Waypoint(Displayed, Fields):
         if not isinstance(other, Waypoint):
             return NotImplemented
         same = self.time == other.time and self.labels == other.labels
-        return same and np.array_equal(self.jet, other.jet, equal_nan=True)
+        return same and np.array_equal(self._shortest_jet, other._shortest_jet, equal_nan=True)
 
     def __hash__(self) -> int:
-        return hash((self.time, self.labels, str((self.jet + 0.0).tolist())))  # -0.0 equals 0.0
+        return hash((self.time, self.labels, str((self._shortest_jet + 0.0).tolist())))  # -0.0 equals 0.0
 
     def __repr__(self) -> str:
         if self.labels is not None:

@@ -352,6 +352,34 @@ def test_new_values_with_other_free_entries_are_those_of_a_new_plan():
         assert got.labels == ("x", "z")
 
 
+def test_plans_from_arrays_and_waypoints_are_equal(tmp_path):
+    """Orders above those prescribed are free, whether an array has them or not."""
+    times, values = data(6, 2)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(6, 2))
+    rest = [[0.0, 0.0]] * 2
+    points = [
+        Waypoint(t, y, *(rest if i in (0, 5) else [])) for i, (t, y) in enumerate(zip(times, values.T, strict=True))
+    ]
+    other = PiecewiseSpline(points)
+    assert plan == other
+    assert hash(plan) == hash(other)
+    assert plan.waypoints == other.waypoints
+    plan.save(tmp_path / "plan.json")
+    loaded = load_trajectory(tmp_path / "plan.json")
+    assert loaded == plan
+    t = np.linspace(times[0], times[-1], 77)
+    np.testing.assert_array_equal(loaded.jet(t, 3), plan.jet(t, 3))
+    assert plan != PiecewiseSpline([*points[:-1], Waypoint(times[-1], values[:, -1], 0.0)])
+
+
+def test_times_without_a_finite_duration_are_rejected():
+    """Each segment has one, but `duration`, `retime` and a grid of times require that of the plan."""
+    with pytest.raises(ValueError, match=r"duration must be finite and above 0, got 1e.308 s after -1e.308 s"):
+        PiecewiseSpline.from_arrays([-1e308, 0.0, 1e308], [0.0, 1.0, 0.0])
+    with pytest.raises(ValueError, match=r"duration must be finite and above 0, got inf s after 1e.308 s"):
+        PiecewiseSpline.cyclic([Waypoint(1e308, 0.0), Waypoint(1.1e308, 1.0)], 1e308)
+
+
 def test_waypoints_of_a_plan_cannot_change_it():
     times, values = data(5, 2)
     given = at_rest(5, 2)
@@ -365,6 +393,39 @@ def test_waypoints_of_a_plan_cannot_change_it():
     t = np.linspace(times[0], times[-1], 55)
     wanted = PiecewiseSpline([Waypoint(p.time, *p.jet) for p in points])
     np.testing.assert_array_equal(again.jet(t, 2), wanted.jet(t, 2))
+
+
+@pytest.mark.parametrize("n", [4, 60])
+@pytest.mark.parametrize("alpha", [0.0, 2.0])
+def test_few_times_give_entries_of_waypoints_in_every_bit(n, alpha):
+    """As a single time and very many do; axes with different free entries are evaluated apart."""
+    times, values = data(n, 2)
+    velocity = np.stack([ends_only(n), np.linspace(-0.3, 0.7, n)])
+    given = {1: velocity, 2: ends_only(n)}
+    rng = np.random.default_rng(2)
+    for chosen in ({1: velocity[1], 2: velocity[1]}, at_rest(n, 2), given):
+        plan = PiecewiseSpline.from_arrays(times, values, derivatives=chosen, alpha=alpha)
+        table = np.stack([values, *(np.broadcast_to(chosen[k], values.shape) for k in (1, 2))])
+        for where in (np.arange(1, 3), rng.permutation(n), np.repeat(np.arange(n), 2)):
+            for left in (False, True):
+                where = where[where > 0] if left else where  # a plan is at rest before its start
+                own, known = plan.jet(times[where], 2, left=left), table[:, :, where]
+                assert ((own == known) | np.isnan(known)).all()
+                np.testing.assert_array_equal(plan(times[where], 1), plan.jet(times[where], 2)[1])
+                for i, moment in zip(where[:3], times[where[:3]].tolist(), strict=True):
+                    one = plan.jet(moment, 2, left=left)
+                    assert ((one == table[:, :, i]) | np.isnan(table[:, :, i])).all()
+
+
+@pytest.mark.parametrize("n", [4, 60])
+def test_few_times_next_to_waypoints_stay_as_they_are(n):
+    """Neighbours of a waypoint in floating point are not replaced by it."""
+    times, values = data(n, 1)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives={1: 2.0, 2: 0.0})
+    t = np.sort(np.concatenate([np.nextafter(times[1:-1], side) for side in (-np.inf, np.inf)]))
+    moves = plan.jet(t, 1)[0, 0] - np.repeat(values[0, 1:-1], 2)
+    slack = 8.0 * np.finfo(float).eps * np.abs(values).max()
+    assert (np.abs(moves - 2.0 * (t - np.repeat(times[1:-1], 2))) <= slack).all()
 
 
 def test_times_before_and_after_a_plan_change_no_others():

@@ -215,7 +215,7 @@ def test_products_are_chebyshev_polynomials(size):
     t = np.append(np.random.default_rng(size).uniform(0.0, 5.0, 300), [0.0, 2.5, 5.0])
     series = np.concatenate([np.random.default_rng(1).normal(size=(3, size)), np.eye(size)])
     out = np.empty((len(series), 1, t.size))
-    sampling.evaluate([(sampling.in_products(series), 0, t.size)], t, 5.0, out)
+    sampling.evaluate([sampling.Part(sampling.in_products(series), 0, t.size, 0.0, 5.0)], t, out)
     exact = chebyshev.chebval(t / 2.5 - 1.0, series.T)
     # Rounding of x and of each square, multiplied by the derivative of the polynomials, at most size^2.
     assert (np.abs(out[:, 0] - exact) <= 4 * EPS * size**2 * np.abs(series).sum(axis=1)[:, None]).all()

@@ -134,3 +134,14 @@ def test_scaled_is_the_same_point_passed_faster(rate, time):
     scaled = point.scaled(time, rate)
     assert scaled.time == time
     np.testing.assert_allclose(scaled.jet, point.jet * rate ** np.arange(3)[:, None], rtol=1e-15)
+
+
+def test_waypoints_are_equal_if_they_prescribe_the_same():
+    short, long = Waypoint(1.0, [2.0, 3.0]), Waypoint(1.0, [2.0, 3.0], [np.nan, np.nan], [np.nan, np.nan])
+    assert short == long
+    assert len({short, long}) == 1
+    assert short.to_dict() == long.to_dict()
+    assert short != Waypoint(1.0, [2.0, 3.0], [np.nan, np.nan], [np.nan, 0.0])
+    assert short != Waypoint(1.0, [2.0, np.nan])
+    free = Waypoint(1.0, np.nan, np.nan)
+    assert free == Waypoint.from_dict(free.to_dict()) == Waypoint(1.0, np.nan)
