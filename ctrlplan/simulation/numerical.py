@@ -20,7 +20,7 @@ from ctrlplan.simulation.job import Job, Record, fresh_job, with_event_times
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, effects, output_uncertainty, remaining, rounding_of
 from ctrlplan.simulation.segments import NetworkRun, Solver, integrate, known_before
-from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
+from ctrlplan.simulation.signals import TimeSignals, breakpoints_of
 from ctrlplan.symbolic.isolation import untouched
 
 VISITED = 12
@@ -179,7 +179,7 @@ class Attempt(Generic[S]):
         Factor by which the tolerances of a step are reduced.
     growth : float
         Growth of a perturbation of the initial state.
-    time_signals : list of TimeSignal
+    time_signals : TimeSignals
         Inputs, then outputs of blocks that are functions of time.
     copies : Network
         Network for trial calls, with copies of blocks that have memory.
@@ -191,7 +191,7 @@ class Attempt(Generic[S]):
     tighter: float = 1.0
     growth: float = 1.0
     drift: Array | float = 0.0
-    time_signals: list[TimeSignal] = field(init=False)
+    time_signals: TimeSignals = field(init=False)
     watched: tuple[Watched, ...] = field(init=False)
     copies: Network = field(init=False)
     solver: S = field(init=False)
@@ -360,12 +360,12 @@ class Attempt(Generic[S]):
         """Some times and states of the run, and the values of the functions of time."""
         some = np.unique(np.linspace(0, self.run.times.size - 1, VISITED).astype(int))
         t = self.run.times[some]
-        return t, self.run.states[:, some], signal_values(self.time_signals, t)
+        return t, self.run.states[:, some], self.time_signals.at(t)
 
     def time_values(self, t: Array) -> Array:
         """Values (nsignals, ntime) of the functions of time; those of the last call if the times are the same."""
         if self._last is None or not np.array_equal(t, self._last[0]):
-            self._last = t, signal_values(self.time_signals, t)
+            self._last = t, self.time_signals.at(t)
         return self._last[1]
 
     def _snapshot(self, t: Array, x: Array) -> Snapshot:
@@ -400,7 +400,7 @@ class Attempt(Generic[S]):
         """Jacobian by the states at the start of the run; nan where blocks raise."""
         t, n = self.job.times[:1], self.job.state.size
         with np.errstate(all="ignore"):
-            values = signal_values(self.time_signals, t)
+            values = self.time_signals.at(t)
             return np.asarray(self.on_trial(self.solver.slopes, t, self.job.state[:, None], values, (-1, n, n))[0])
 
 

@@ -11,13 +11,14 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._lru import Lru
 from ctrlplan._types import Array
 from ctrlplan.trajectories import Step, Trajectory, chebyshev
 from ctrlplan.trajectories.files import signal_rows
@@ -39,6 +40,9 @@ _DENSE = np.cos(np.linspace(0.0, np.pi, 4 * WIDTHS[-1]))
 
 _ROUNDING = 1e-13
 """Violation of the bounds, relative to the terms of a series, that counts as rounding."""
+
+_VALUES, _SHARED, _SEGMENTS = 8, 200_000, 64
+"""Number of arrays of times of which values are shared by runs, maximum size of such values, and number of segments."""
 
 _NOISE = 1e-11
 """Relative magnitude up to which the later half of the longest series counts as rounding errors."""
@@ -195,6 +199,62 @@ class SampledSignal:
         return self._ends[left : left + 2]
 
 
+class TimeSignals(tuple[TimeSignal, ...]):
+    """Functions of time of a run in order; their values and series are shared by runs if all of them are plans."""
+
+    def __init__(self, signals: Iterable[TimeSignal]) -> None:
+        self._values: Lru[bytes, Array] = Lru(_VALUES)
+        self._series: Lru[tuple[float, float, float, bytes], list[Series]] = Lru(_SEGMENTS)
+        self._fixed = all(isinstance(signal, PlanSignal) for signal in self)
+
+    def at(self, times: Array) -> Array:
+        """Values (nsignals, ntime), right-continuous; read-only if they are shared."""
+        if not self._fixed or times.size * self.width > _SHARED:
+            return signal_values(self, times)
+        return self._values.get(times.tobytes(), lambda: _read_only(signal_values(self, times)))
+
+    @property
+    def width(self) -> int:
+        """Number of all signals."""
+        return sum(signal.width for signal in self)
+
+    def series(self, moment: float, left: float, until: float, accuracy: float, rounding: Array) -> list[Series]:
+        """Series and bounds of the signals over a segment.
+
+        Parameters
+        ----------
+        moment : float
+            A time inside [s].
+        left, until : float
+            The segment [s], without a breakpoint inside.
+        accuracy : float
+            Maximum truncation error, relative to each signal.
+        rounding : ndarray, shape (nsignals,)
+            Rounding errors of the signals.
+        """
+        if not self._fixed:
+            return self._resolved(moment, left, until, accuracy, rounding)
+        key = left, until, accuracy, rounding.tobytes()
+        return self._series.get(key, lambda: self._resolved(moment, left, until, accuracy, rounding))
+
+    def _resolved(self, moment: float, left: float, until: float, accuracy: float, rounding: Array) -> list[Series]:
+        lines = [signal.ends(left, until) for signal in self]
+        known = [line for line in lines if line is not None]
+        if known and len(known) == len(lines):
+            return [straight(left, until, *(np.concatenate(values) for values in zip(*known, strict=True)))]
+        return [
+            series.bounded(*self._bounds(moment, series.left, series.right))
+            for series in resolved(partial(self._analytic_at, moment, left), left, until, accuracy, rounding)
+        ]
+
+    def _analytic_at(self, moment: float, origin: float, s: Array) -> Array:
+        return np.concatenate([np.zeros((0, s.size)), *(signal.analytic_at(moment, origin, s) for signal in self)])
+
+    def _bounds(self, moment: float, left: float, right: float) -> list[Array]:
+        found = [signal.bounds(moment, left, right) for signal in self]
+        return [np.concatenate([np.zeros(0), *(pair[side] for pair in found)]) for side in (0, 1)]
+
+
 def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[TimeSignal]:
     """Input signals of a system, in order.
 
@@ -332,6 +392,11 @@ def straight(left: float, right: float, first: Array, last: Array) -> Series:
 def _unbounded(left: float, right: float, coefficients: Array) -> Series:
     free = np.full(len(coefficients), np.inf)
     return Series(left, right, coefficients, -free, free)
+
+
+def _read_only(values: Array) -> Array:
+    values.flags.writeable = False
+    return values
 
 
 def _ordered(ends: Array) -> tuple[Array, Array]:
