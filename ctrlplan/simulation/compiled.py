@@ -112,7 +112,8 @@ class Compiled:
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
         self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(_sparse(network.read) @ w)])
         self._functions["switches"] = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]))
-        self.compared = Compared(self._functions["switches"].numel_out(0))
+        self.nswitches = self._functions["switches"].numel_out(0)
+        self.compared = Compared(self.nswitches)
         jumps = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]), bends=False)
         self._timed = [self._of_time("switches", self._functions["switches"], network, 0)]
         self._timed += [self._of_time("jumps", jumps, network, 2)]

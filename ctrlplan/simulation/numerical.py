@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -276,43 +276,12 @@ class Attempt(Generic[S]):
             np.append(x, displaced, axis=1),
             np.append(time_values, time_values[:, some], axis=1),
         )
-        return self.on_trial(self.solver.slopes, *places, (-1, self.moving.size, self.moving.size))
-
-    def on_trial(
-        self,
-        function: Callable[[Array, Array, Array], Array],
-        t: Array,
-        x: Array,
-        time_values: Array,
-        shape: tuple[int, ...],
-    ) -> Array:
-        """Values of a function at states that a run may not have reached; nan where blocks raise.
-
-        In `shape`, that of the result, -1 is the axis of the times.
-        """
-        if not self.solver.calls_blocks:
-            return function(t, x, time_values)
-        axis, empty = shape.index(-1), np.full([abs(size) for size in shape], np.nan)
-
-        def at(some: slice) -> Array | None:
-            try:
-                return function(t[some], x[:, some], time_values[:, some])
-            except (KeyboardInterrupt, TimeLimitError):
-                raise
-            except BaseException:  # outside the domain of a block, as a perturbed argument may be
-                return None
-
-        with untouched():
-            whole = at(slice(None))
-            if whole is not None:
-                return whole
-            found = [at(slice(k, k + 1)) for k in range(t.size)]
-        return np.concatenate([empty if part is None else part for part in found], axis=axis)
+        return on_trial(self.solver, self.solver.slopes, *places, (-1, self.moving.size, self.moving.size))
 
     def record(self) -> Record:
         """Record of the run, with a note on its accuracy if that is insufficient."""
-        said = _accuracy_note(self)
-        reason = f"{self.job.reason}; {said}" if said else self.job.reason
+        is_pure = not self.solver.calls_blocks
+        reason = _reason_of(self)
         return Record(
             self.run.times,
             self.run.states,
@@ -320,7 +289,8 @@ class Attempt(Generic[S]):
             self._state_at,
             self.watched,
             self.method.name,
-            reason,
+            reason if is_pure else reason(),
+            is_pure,
             self._snapshot_inside,
         )
 
@@ -347,7 +317,8 @@ class Attempt(Generic[S]):
         t, x, time_values = self.visited
         duration = float(self.run.times[-1] - self.run.times[0])
         shape = (len(x), -1)
-        return duration * rounding_of(lambda near: self.on_trial(self.solver.rates, t, near, time_values, shape), x)
+        rates = partial(on_trial, self.solver, self.solver.rates)
+        return duration * rounding_of(lambda near: rates(t, near, time_values, shape), x)
 
     def passed_on(self, errors: Array) -> Array:
         """Errors (nstates,) of the integrated states caused by errors of others."""
@@ -369,21 +340,16 @@ class Attempt(Generic[S]):
         return self._last[1]
 
     def _snapshot(self, t: Array, x: Array) -> Snapshot:
-        return self._seen(t, x, self.time_values(t))
+        ninputs = self.job.prepared.ninputs
+        if not ninputs:
+            return _seen(self.solver, t, x, np.zeros((0, t.size)), partial(self.time_signals.at, t))
+        known = self.time_values(t)  # the caller may change samples later
+        return _seen(self.solver, t, x, known[:ninputs], lambda: known)
 
     def _snapshot_inside(self, t: Array, x: Array) -> Snapshot:
         """Snapshot at one time, with the series of the functions of time."""
-        return self._seen(t, x, self.run.series(float(t[0]))(float(t[0]))[:, None])
-
-    def _seen(self, t: Array, x: Array, time_values: Array) -> Snapshot:
-        solver = self.solver
-        return Snapshot(
-            t,
-            x,
-            time_values[: self.job.prepared.ninputs],
-            lambda: solver.outputs(t, x, time_values),
-            lambda: solver.signals(t, x, time_values),
-        )
+        known = self.run.series(float(t[0]))(float(t[0]))[:, None]
+        return _seen(self.solver, t, x, known[: self.job.prepared.ninputs], lambda: known)
 
     def _state_at(self, k: int, t: float) -> Array:
         start = float(self.run.times[k])
@@ -400,8 +366,8 @@ class Attempt(Generic[S]):
         """Jacobian by the states at the start of the run; nan where blocks raise."""
         t, n = self.job.times[:1], self.job.state.size
         with np.errstate(all="ignore"):
-            values = self.time_signals.at(t)
-            return np.asarray(self.on_trial(self.solver.slopes, t, self.job.state[:, None], values, (-1, n, n))[0])
+            places = t, self.job.state[:, None], self.time_signals.at(t)
+            return np.asarray(on_trial(self.solver, self.solver.slopes, *places, (-1, n, n))[0])
 
 
 def equations_of(job: Job, network: Network) -> Interpreted | None:
@@ -409,35 +375,78 @@ def equations_of(job: Job, network: Network) -> Interpreted | None:
     return Interpreted(network, job.params, (job.first, job.state), job.trials) if network.blocks else None
 
 
-def _accuracy_note(attempt: Attempt[S]) -> str:
-    """Note on uncertain outputs with the tolerance that suffices; empty if there are none."""
+def _seen(solver: NumericalSolver, t: Array, x: Array, u: Array, time_values: Callable[[], Array]) -> Snapshot:
+    """Snapshot of a run."""
+    return Snapshot(t, x, u, lambda: solver.outputs(t, x, time_values()), lambda: solver.signals(t, x, time_values()))
+
+
+def on_trial(
+    solver: NumericalSolver,
+    function: Callable[[Array, Array, Array], Array],
+    t: Array,
+    x: Array,
+    time_values: Array,
+    shape: tuple[int, ...],
+) -> Array:
+    """Values of a function at states that a run may not have reached; nan where blocks raise.
+
+    In `shape`, that of the result, -1 is the axis of the times.
+    """
+    if not solver.calls_blocks:
+        return function(t, x, time_values)
+    axis, empty = shape.index(-1), np.full([abs(size) for size in shape], np.nan)
+
+    def at(some: slice) -> Array | None:
+        try:
+            return function(t[some], x[:, some], time_values[:, some])
+        except (KeyboardInterrupt, TimeLimitError):
+            raise
+        except BaseException:  # outside the domain of a block, as a perturbed argument may be
+            return None
+
+    with untouched():
+        whole = at(slice(None))
+        if whole is not None:
+            return whole
+        found = [at(slice(k, k + 1)) for k in range(t.size)]
+    return np.concatenate([empty if part is None else part for part in found], axis=axis)
+
+
+def _reason_of(attempt: Attempt[S]) -> Callable[[], str]:
+    """Function that returns why the method was chosen, with a note on uncertain outputs if there are any."""
     job, run, solver, scales = attempt.job, attempt.run, attempt.solver, attempt.scales
     t, x, time_values = attempt.visited
+    reason, labels, moving = job.reason, job.prepared.output_labels, attempt.moving
     if not x.size or not np.isfinite(x).all():
-        return ""
-    known = scales.with_sampled(run.states, attempt.moving)
-    own = known.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
-    uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
+        return lambda: reason
+    own = scales.with_sampled(run.states, moving).uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
+    drift, rtol, relative, expands = attempt.drift, job.rtol, scales.relative, attempt.growth > _GROWTH
 
     def outputs(near: Array) -> Array:
         copies = near.shape[1] // t.size
         places = np.tile(t, copies), near, np.tile(time_values, copies)
-        return attempt.on_trial(solver.outputs, *places, (count, -1))
+        return on_trial(solver, solver.outputs, *places, (len(labels), -1))
 
-    worst, ranges = output_uncertainty(outputs, x, uncertainty, attempt.moving)
-    allowed = max(_UNCERTAIN, 100.0 * job.rtol) * ranges
-    uncertain = (ranges > 0.0) & (worst > allowed)
-    if not uncertain.any():
-        return ""
-    part = np.where(uncertain, worst / np.where(uncertain, ranges, 1.0), 0.0)
-    names = ", ".join(np.array(job.prepared.output_labels)[uncertain])
-    needed = job.rtol * _UNCERTAIN / float(part.max())
-    what = "are differences of larger terms" if attempt.growth <= _GROWTH else "diverge from neighbouring solutions"
-    if np.any(attempt.drift > own):
-        what = "depend on small fractions of large states"
-    advice = (
-        f"rtol = {needed:.0e} suffices for {_UNCERTAIN:.0e}"
-        if needed > 1e-12 / scales.relative.min()
-        else "no tolerance suffices"
-    )
-    return f"outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: {advice}"
+    def found() -> str:
+        worst, ranges = output_uncertainty(outputs, x, own + drift, moving)
+        allowed = max(_UNCERTAIN, 100.0 * rtol) * ranges
+        uncertain = (ranges > 0.0) & (worst > allowed)
+        if not uncertain.any():
+            return reason
+        part = np.where(uncertain, worst / np.where(uncertain, ranges, 1.0), 0.0)
+        names = ", ".join(np.array(labels)[uncertain])
+        needed = rtol * _UNCERTAIN / float(part.max())
+        what = "diverge from neighbouring solutions" if expands else "are differences of larger terms"
+        if np.any(drift > own):
+            what = "depend on small fractions of large states"
+        advice = (
+            f"rtol = {needed:.0e} suffices for {_UNCERTAIN:.0e}"
+            if needed > 1e-12 / relative.min()
+            else "no tolerance suffices"
+        )
+        return (
+            f"{reason}; outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: "
+            f"{advice}"
+        )
+
+    return found

@@ -86,7 +86,7 @@ def _disagreement(attempt: Attempt[CompiledSolver], solver: CompiledSolver) -> s
     """Disagreement of a compiled form with Python at states of a run; empty if none, or if no comparison is due."""
     job, run, form = attempt.job, attempt.run, solver.form
     p = form.parameters(job.params)
-    values = attempt.time_values(run.times)
+    values = attempt.time_values(run.times) if form.nswitches else np.empty((0, run.times.size))
     if not form.compared.is_due(form.sides(run.times, run.states, values, p)):
         return ""
     count = max(1, solver.evaluations // _SHARE) if solver.evaluations else VISITED
