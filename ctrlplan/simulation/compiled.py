@@ -123,7 +123,7 @@ class Compiled:
         )
         self._integrators: Lru[tuple[object, ...], Segment] = Lru(_CACHE_SIZE)
         self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
-        self._equations: dict[int, dict[str, ca.SX]] = {}
+        self._equations: dict[tuple[int, bool], dict[str, ca.SX]] = {}
 
     def __getstate__(self) -> dict[str, object]:
         """State without what can be rebuilt."""
@@ -235,8 +235,9 @@ class Compiled:
             "disable_internal_warnings": True,
         }
         grid = np.frombuffer(settings.grid).tolist()
+        equations = self._segment_equations(settings.width, settings.harmonic)
         with passing_interruptions():
-            made = ca.integrator("segment", "cvodes", self._segment_equations(settings.width), 0.0, grid, options)
+            made = ca.integrator("segment", "cvodes", equations, 0.0, grid, options)
         return Segment(made, self.moving.size)
 
     def _at_many(self, name: str, t: Array, x: Array, time_values: Array, p: Array) -> Array:
@@ -246,12 +247,13 @@ class Compiled:
         at_all = self._maps.get((name, t.size), lambda: function.map(t.size))
         return _called(at_all, (t, x, time_values, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 
-    def _segment_equations(self, width: int) -> dict[str, ca.SX]:
-        """Equations of scaled states over s in [0, 1], with functions of time as Chebyshev series of given width.
+    def _segment_equations(self, width: int, harmonic: bool) -> dict[str, ca.SX]:
+        """Equations of scaled states over s in [0, 1], with functions of time as sums of a number of terms.
 
-        The states of sampled blocks, which are constant, are among the parameters.
+        The states of sampled blocks, which are constant, are among the parameters. Terms are Chebyshev polynomials, or
+        harmonics; the fourth number of `span` is then their rate instead of the end of the series.
         """
-        if width not in self._equations:
+        if (width, harmonic) not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
             moving = self.moving.tolist()
             shapes = {"s": (1,), "z": (len(moving),), "p": (np_,), "c": (nd, width), "bounds": (nd, 2)}
@@ -261,17 +263,22 @@ class Compiled:
             x[moving] = shift + scale * z
             left, length, first, last, earliest, latest = (span[k] for k in range(6))
             t = ca.fmin(ca.fmax(left + s * length, earliest), latest)
-            time_values = _series(c, (2.0 * t - first - last) / (last - first))
+            terms = (
+                _harmonics(last * (t - first), width)
+                if harmonic
+                else _chebyshev(2.0 * t - first - last, last - first, width)
+            )
+            time_values = c @ terms
             if width > 1:  # nan is preserved
                 time_values = ca.if_else(time_values < bounds[:, 0], bounds[:, 0], time_values)
                 time_values = ca.if_else(time_values > bounds[:, 1], bounds[:, 1], time_values)
-            self._equations[width] = {
+            self._equations[width, harmonic] = {
                 "t": s,
                 "x": z,
                 "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), shift, scale, span, start),
                 "ode": length * self._rates(t, x, time_values, p)[moving] / scale,
             }
-        return self._equations[width]
+        return self._equations[width, harmonic]
 
     def _own_parameters(self, p: ca.SX) -> list[ca.SX]:
         """Entries of p for each block."""
@@ -281,9 +288,10 @@ class Compiled:
 
 
 class Settings(NamedTuple):
-    """What an integrator of a segment is built for: terms of the series, output times (bytes), CVODES."""
+    """What an integrator of a segment is built for: terms of the functions of time, output times (bytes), CVODES."""
 
     width: int
+    harmonic: bool
     grid: bytes
     kind: Kind
     rtol: float
@@ -424,10 +432,8 @@ class CompiledSolver:
     def _advanced(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """The same for times that are not too close together."""
         moving = self.form.moving
-        out = np.empty((state.size, grid.size))
-        out[:] = state[:, None]
         if not moving.size:
-            return out
+            return np.repeat(state[:, None], grid.size, axis=1)
         right = float(grid[-1])
         if right - left > self._longest or self._segments % _KIND_KEPT == 0:
             self._longest = max(self._longest, right - left)
@@ -436,20 +442,24 @@ class CompiledSolver:
         relative = _ONLY_END if grid.size == 1 else _pattern((grid - left) / (right - left))
         settings = self._settings(series, relative)
         if self._is_rare(settings, grid.size):
-            for k in range(grid.size):
-                out[:, k] = self._advanced(series, left, grid[k : k + 1], state)[:, 0]
-            return out
+            each = [self._advanced(series, left, grid[k : k + 1], state) for k in range(grid.size)]
+            return np.concatenate(each, axis=1)
         if series is not self._series:
-            parts = [self._p, series.coefficients.ravel(order="F"), series.low, series.high, self._shift, self._scale]
+            parts = [self._p, _terms(series).ravel(order="F"), series.low, series.high, self._shift, self._scale]
             self._known, self._series = np.concatenate(parts), series
-        span = (left, right - left, series.left, series.right, *within(left, right, self.switches))
+        last = series.right if series.harmonics is None else series.harmonics.rate
+        span = (left, right - left, series.left, last, *within(left, right, self.switches))
         start = (state[moving] - self._shift) / self._scale
         try:
             found = self._solved(settings, (start, self._known, span, state), relative)
         except _SegmentError as error:
             why = f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {error}"
             raise SolverError(why) from None
-        out[moving] = self._shift[:, None] + self._scale[:, None] * found
+        unscaled = (self._shift + self._scale * found.T).T
+        if moving.size == state.size:
+            return unscaled
+        out = np.repeat(state[:, None], grid.size, axis=1)
+        out[moving] = unscaled
         return out
 
     def count(self) -> None:
@@ -460,8 +470,10 @@ class CompiledSolver:
         # Equations that depend on time are evaluated at least once per sample, so that no pulse is skipped.
         longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self.form.depends_on_time else 0.0
         allowed = min(_FEW_STEPS, self._max_steps)
-        width = series.coefficients.shape[1]
-        return Settings(width, relative.tobytes(), self._kind, *self._tolerances, allowed, longest)
+        width = _terms(series).shape[1]
+        return Settings(
+            width, series.harmonics is not None, relative.tobytes(), self._kind, *self._tolerances, allowed, longest
+        )
 
     def _is_rare(self, settings: Settings, count: int) -> bool:
         """Whether a pattern of some output times is integrated to each of them, without an integrator of its own."""
@@ -635,10 +647,26 @@ def _sparse(matrix: ArrayLike) -> ca.DM:
     return ca.sparsify(ca.DM(np.asarray(matrix, dtype=float)))
 
 
-def _series(coefficients: ca.SX, u: ca.SX) -> ca.SX:
-    """Chebyshev series (nsignals, width) at u; the polynomials are shared by all signals."""
-    width = coefficients.shape[1]
+def _terms(series: Series) -> Array:
+    """Coefficients (nsignals, width) of the functions of time of a segment: of harmonics if they are known."""
+    return series.coefficients if series.harmonics is None else series.harmonics.coefficients
+
+
+def _chebyshev(numerator: ca.SX, length: ca.SX, width: int) -> ca.SX:
+    """Chebyshev polynomials (width,) at numerator / length."""
+    u = numerator / length
+    twice = 2.0 * u
     values = [ca.SX(1), u]
     while len(values) < width:
-        values.append(2.0 * u * values[-1] - values[-2])
-    return coefficients @ ca.vertcat(*values[:width])
+        values.append(twice * values[-1] - values[-2])
+    return ca.vertcat(*values[:width])
+
+
+def _harmonics(angle: ca.SX, width: int) -> ca.SX:
+    """Terms (width,) of `Harmonics` at an angle."""
+    c1, s1 = ca.cos(angle), ca.sin(angle)
+    c, s, values = c1, s1, [ca.SX(1)]
+    while len(values) < width:
+        values += [c, s]
+        c, s = c * c1 - s * s1, s * c1 + c * s1
+    return ca.vertcat(*values)

@@ -18,7 +18,16 @@ from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.job import Job, Record, fresh_job, with_event_times
 from ctrlplan.simulation.network import Network
-from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, effects, output_uncertainty, remaining, rounding_of
+from ctrlplan.simulation.scales import (
+    PASSES,
+    Scales,
+    Tolerances,
+    effects,
+    growth_rates,
+    output_uncertainty,
+    remaining,
+    rounding_of,
+)
 from ctrlplan.simulation.segments import NetworkRun, Solver, integrate, known_before
 from ctrlplan.simulation.signals import TimeSignals, breakpoints_of
 from ctrlplan.symbolic.isolation import untouched
@@ -262,7 +271,12 @@ class Attempt(Generic[S]):
     @cached_property
     def effects(self) -> Array:
         """Largest displacement of each integrated state by a unit error of another, shape (nmoving, nmoving)."""
-        return effects(self._slopes, float(self.run.times[-1] - self.run.times[0]))
+        return effects(self._slopes, float(self.run.times[-1] - self.run.times[0]), self._growth_rates)
+
+    @cached_property
+    def _growth_rates(self) -> Array:
+        """Largest growth rates of perturbations at the points of `_slopes`; nan where they are not finite."""
+        return growth_rates(self._slopes)
 
     @cached_property
     def _slopes(self) -> Array:
@@ -297,10 +311,9 @@ class Attempt(Generic[S]):
     def expands(self) -> bool:
         """Whether neighbouring solutions may diverge, by the largest growth rate along the run."""
         t = self.visited[0]
-        slopes = self._slopes[: t.size]
-        if t.size < 2 or not slopes.size or not np.isfinite(slopes).all():
+        rates = self._growth_rates[: t.size]
+        if t.size < 2 or not self._slopes.size or not np.isfinite(rates).all():
             return False
-        rates = np.maximum(np.linalg.eigvals(slopes).real.max(axis=1), 0.0)
         return float(trapezoid(rates, t)) > math.log(_GROWTH)
 
     @property

@@ -12,7 +12,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._checks import real_array
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array
-from ctrlplan.trajectories import Step, Trajectory, chebyshev
+from ctrlplan.trajectories import Step, Trajectory, TrigSpline, chebyshev
 from ctrlplan.trajectories.files import signal_rows
 
 Inputs = Trajectory | ArrayLike | Mapping[str, Trajectory | ArrayLike] | None
@@ -44,8 +44,33 @@ _ROUNDING = 1e-13
 _VALUES, _SHARED, _SEGMENTS = 8, 200_000, 64
 """Number of arrays of times of which values are shared by runs, maximum size of such values, and number of segments."""
 
+_CANCELLED = 16.0
+"""Maximum sum of the coefficients of a trigonometric sum relative to its largest value; more would cancel."""
+
 _NOISE = 1e-11
 """Relative magnitude up to which the later half of the longest series counts as rounding errors."""
+
+
+class Harmonics(NamedTuple):
+    """Sum over 1, cos(a), sin(a), cos(2 a), ..., a = rate (t - left), with coefficients (nsignals, 2 n + 1)."""
+
+    rate: float
+    coefficients: Array
+
+    @classmethod
+    def fitted(
+        cls, series: Series, rate: float, count: int, accuracy: float, rounding: Array | float
+    ) -> Harmonics | None:
+        """Sum with `count` harmonics that is equal to a series up to rounding; None if there is none."""
+        nodes = chebyshev_times(series.left, series.right, 4 * count + 2)
+        between = 0.5 * (nodes[1:] + nodes[:-1])
+        values, terms = _unclipped(series, nodes), harmonic_terms(rate * (nodes - series.left), count)
+        found: Array = np.linalg.lstsq(terms.T, values.T, rcond=1e-12)[0].T.astype(float)
+        size = np.abs(values).max(axis=1, keepdims=True)
+        if np.any(np.abs(found).sum(axis=1, keepdims=True) > _CANCELLED * size):
+            return None
+        apart = np.abs(found @ harmonic_terms(rate * (between - series.left), count) - _unclipped(series, between))
+        return cls(rate, found) if np.all(apart <= np.maximum(accuracy * size, np.reshape(rounding, (-1, 1)))) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +82,8 @@ class Series:
     low, high : ndarray, shape (nsignals,)
         Bounds to which values are clipped, since rounding may violate them;
         infinite if they are not known.
+    harmonics : Harmonics or None
+        The same signals as a trigonometric sum, if they are one with fewer terms.
     """
 
     left: float
@@ -64,6 +91,7 @@ class Series:
     coefficients: Array
     low: Array
     high: Array
+    harmonics: Harmonics | None = None
 
     def __call__(self, t: float) -> Array:
         """All signals at one time, shape (nsignals,)."""
@@ -81,6 +109,12 @@ class Series:
         u = np.clip((2.0 * times - self.left - self.right) / (self.right - self.left), -1.0, 1.0)
         values = self.coefficients @ np.cos(_counts(self.coefficients.shape[1])[:, None] * np.arccos(u))
         return np.asarray(np.clip(values, self.low[:, None], self.high[:, None]))
+
+    def with_harmonics(self, known: tuple[float, int] | None, accuracy: float, rounding: Array | float) -> Series:
+        """Same signals with their trigonometric sum of known rate and number of harmonics, if it has fewer terms."""
+        if known is None or self.coefficients.shape[1] <= 2 * known[1] + 1:
+            return self
+        return replace(self, harmonics=Harmonics.fitted(self, *known, accuracy, rounding))
 
     def bounded(self, low: Array, high: Array) -> Series:
         """Same signals with bounds, unless they violate these by more than rounding."""
@@ -150,6 +184,13 @@ class PlanSignal:
             return None
         value = self.analytic_at(0.5 * (left + right), left, np.zeros(1))[:, 0]
         return value, value
+
+    @property
+    def harmonics(self) -> tuple[float, int] | None:
+        """Rate [rad/s] and number of harmonics of a trigonometric spline; None for other plans."""
+        if not isinstance(self.plan, TrigSpline) or not self.plan.alpha:
+            return None
+        return self.plan.alpha / self.plan.duration, max(self.plan.degree)
 
     def at(self, times: Array) -> Array:
         """Values of the plan."""
@@ -242,8 +283,12 @@ class TimeSignals(tuple[TimeSignal, ...]):
         known = [line for line in lines if line is not None]
         if known and len(known) == len(lines):
             return [straight(left, until, *(np.concatenate(values) for values in zip(*known, strict=True)))]
+        sums = {signal.harmonics for signal in self if isinstance(signal, PlanSignal)} - {None}
+        harmonics = sums.pop() if self._fixed and len(sums) == 1 else None
         return [
-            series.bounded(*self._bounds(moment, series.left, series.right))
+            series.bounded(*self._bounds(moment, series.left, series.right)).with_harmonics(
+                harmonics, accuracy, rounding
+            )
             for series in resolved(partial(self._analytic_at, moment, left), left, until, accuracy, rounding)
         ]
 
@@ -253,6 +298,13 @@ class TimeSignals(tuple[TimeSignal, ...]):
     def _bounds(self, moment: float, left: float, right: float) -> list[Array]:
         found = [signal.bounds(moment, left, right) for signal in self]
         return [np.concatenate([np.zeros(0), *(pair[side] for pair in found)]) for side in (0, 1)]
+
+
+def harmonic_terms(angle: Array, count: int) -> Array:
+    """Terms (2 count + 1, n) of `Harmonics` at angles (n,)."""
+    multiples = np.arange(1.0, count + 1.0)[:, None] * angle
+    pairs = np.stack([np.cos(multiples), np.sin(multiples)], axis=1).reshape(2 * count, -1)
+    return np.concatenate([np.ones((1, angle.size)), pairs])
 
 
 def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[TimeSignal]:
@@ -392,6 +444,12 @@ def straight(left: float, right: float, first: Array, last: Array) -> Series:
 def _unbounded(left: float, right: float, coefficients: Array) -> Series:
     free = np.full(len(coefficients), np.inf)
     return Series(left, right, coefficients, -free, free)
+
+
+def _unclipped(series: Series, times: Array) -> Array:
+    """Values (nsignals, ntime) of a series, not clipped to its bounds."""
+    u = (2.0 * times - series.left - series.right) / (series.right - series.left)
+    return np.asarray(np.polynomial.chebyshev.chebval(u, series.coefficients.T))
 
 
 def _read_only(values: Array) -> Array:
