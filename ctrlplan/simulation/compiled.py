@@ -71,6 +71,19 @@ class Kind(Enum):
     FIXED_POINT = "adams", "functional"
 
 
+class Motion(NamedTuple):
+    """Norm of a Jacobian [1/s] and its fastest decay rate [1/s]; infinite where it is not finite."""
+
+    norm: float
+    decay: float
+
+    def kind(self, length: float) -> Kind:
+        """Kind of integration for a segment of given length [s]."""
+        if self.norm * length < _SHORT:
+            return Kind.FIXED_POINT
+        return Kind.BDF if self.decay * length > _STIFF else Kind.ADAMS
+
+
 class Compiled:
     """Equations of a network as CasADi functions of (t, x, time_values, p).
 
@@ -203,14 +216,12 @@ class Compiled:
                     return f"block {block.name} cannot be traced ({wrong})"
         return ""
 
-    def kind(self, t: float, x: Array, time_values: Array, p: Array, length: float) -> Kind:
-        """Kind of integration for a segment of given length, by the equations linearised at a state."""
+    def motion(self, t: float, x: Array, time_values: Array, p: Array) -> Motion:
+        """Rates of motion by the equations linearised at a state."""
         jacobian = _called(self._jacobian, (np.array([t]), x, time_values, p), self.moving.size)
         if not np.isfinite(jacobian).all():
-            return Kind.BDF
-        if np.linalg.norm(jacobian) * length < _SHORT:
-            return Kind.FIXED_POINT
-        return Kind.BDF if -np.linalg.eigvals(jacobian).real.min() * length > _STIFF else Kind.ADAMS
+            return Motion(np.inf, np.inf)
+        return Motion(float(np.linalg.norm(jacobian)), -float(np.linalg.eigvals(jacobian).real.min()))
 
     def integrator(self, settings: Settings) -> Segment:
         """CVODES over a segment scaled to length 1, with outputs at given times."""
@@ -245,7 +256,8 @@ class Compiled:
         if not function.numel_out(0):  # no signals without inputs and outputs
             return np.zeros((0, t.size))
         at_all = self._maps.get((name, t.size), lambda: function.map(t.size))
-        return _called(at_all, (t, x, time_values, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
+        repeated = np.repeat(p[:, None], t.size, axis=1) if p.size else p
+        return _called(at_all, (t, x, time_values, repeated), function.numel_out(0))
 
     def _segment_equations(self, width: int, harmonic: bool) -> dict[str, ca.SX]:
         """Equations of scaled states over s in [0, 1], with functions of time as sums of a number of terms.
@@ -370,6 +382,7 @@ class CompiledSolver:
         self._shift, self._scale = scales.shift[self.moving], scales.scale[self.moving]
         self._tolerances = float(tolerances.rtol.min(initial=1.0)), tolerances.atol
         self._longest, self._kind, self._segments, self._patterns = 0.0, Kind.ADAMS, 0, 0
+        self._motion = Motion(0.0, 0.0)
         self._counts = equations.compared.is_expected
         self._series: Series | None = None
         self._known = np.empty(0)
@@ -435,9 +448,11 @@ class CompiledSolver:
         if not moving.size:
             return np.repeat(state[:, None], grid.size, axis=1)
         right = float(grid[-1])
+        if self._segments % _KIND_KEPT == 0:
+            self._motion = self.form.motion(left, state, series(left), self._p)
         if right - left > self._longest or self._segments % _KIND_KEPT == 0:
             self._longest = max(self._longest, right - left)
-            self._kind = self.form.kind(left, state, series(left), self._p, self._longest)
+            self._kind = self._motion.kind(self._longest)
         self._segments += 1
         relative = _ONLY_END if grid.size == 1 else _pattern((grid - left) / (right - left))
         settings = self._settings(series, relative)
@@ -455,11 +470,13 @@ class CompiledSolver:
         except _SegmentError as error:
             why = f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {error}"
             raise SolverError(why) from None
-        unscaled = (self._shift + self._scale * found.T).T
+        found = np.array(found, order="C")  # each state contiguous: reductions over time are then fast
+        found *= self._scale[:, None]
+        found += self._shift[:, None]
         if moving.size == state.size:
-            return unscaled
+            return found
         out = np.repeat(state[:, None], grid.size, axis=1)
-        out[moving] = unscaled
+        out[moving] = found
         return out
 
     def count(self) -> None:
@@ -527,7 +544,7 @@ def _called(function: ca.Function, arguments: Sequence[Array], nrows: int) -> Ar
     out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
     given: tuple[Value, Callable[[], None]] = function.buffer()  # not in the type stubs of CasADi
     buffer, evaluate = given
-    columns = [np.ravel(values, order="F").astype(float) for values in arguments]
+    columns = [values.ravel(order="F").astype(float, copy=False) for values in arguments]
     for k, values in enumerate(columns):
         if values.size:
             buffer.set_arg(k, values.data)

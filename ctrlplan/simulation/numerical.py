@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -109,7 +109,7 @@ def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     attempt = Attempt(job, method, scales)
     attempt.go()
     for _ in range(PASSES - 1 if job.atol is None else 0):
-        found = scales.renewed(attempt.run.states, attempt.moving, attempt.noise, attempt.passed_on)
+        found = scales.renewed(attempt.hull, attempt.moving, attempt.noise, attempt.passed_on)
         if found is None:
             break
         following = Attempt(fresh, method, found)
@@ -157,7 +157,7 @@ def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
         return attempt
     try:
         scales = attempt.scales.with_closer_states(
-            attempt.run.states,
+            attempt.hull,
             loose,
             attempt.noise(),
             attempt.solver.evaluations if attempt.solver.relative_by_state else None,
@@ -166,7 +166,7 @@ def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
         again.solver.count()
         again.go()
     except SolverError:
-        own = attempt.scales.uncertainty(attempt.run.states, attempt.job.rtol)
+        own = attempt.scales.uncertainty(attempt.hull, attempt.job.rtol)
         attempt.drift = np.zeros(own.size)
         attempt.drift[attempt.moving] = own[attempt.moving] @ attempt.effects.T
         return attempt
@@ -244,7 +244,7 @@ class Attempt(Generic[S]):
 
     def loose(self) -> NDArray[np.bool_]:
         """States (nstates,) whose tolerances are too large for the accuracy of other states."""
-        states, scales, moving = self.run.states, self.scales, self.moving
+        states, scales, moving = self.hull, self.scales, self.moving
         loose = np.zeros(len(states), dtype=bool)
         if moving.size < 2 or not np.isfinite(states).all():
             return loose
@@ -262,6 +262,12 @@ class Attempt(Generic[S]):
             )
         loose[moving] = found.any(axis=0)
         return loose
+
+    @cached_property
+    def hull(self) -> Array:
+        """States (nstates, 3): initial ones, minima and maxima of the run, nan where a state is."""
+        states = self.run.states
+        return np.stack([states[:, 0], states.min(axis=1), states.max(axis=1)], axis=1)
 
     @property
     def moving(self) -> NDArray[np.intp]:
@@ -284,7 +290,7 @@ class Attempt(Generic[S]):
         t, x, time_values = self.visited
         some = slice(None, None, VISITED // _DISPLACED)
         # At samples that are full turns of an angle apart, the slope of its sine is the same and may be 0.
-        displaced = x[:, some] * (1.0 + _JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, x[:, some].shape))
+        displaced = x[:, some] * (1.0 + _JITTER * _random(*x[:, some].shape))
         places = (
             np.append(t, t[some]),
             np.append(x, displaced, axis=1),
@@ -383,6 +389,14 @@ class Attempt(Generic[S]):
             return np.asarray(on_trial(self.solver, self.solver.slopes, *places, (-1, n, n))[0])
 
 
+@lru_cache(maxsize=32)
+def _random(nrows: int, ncolumns: int) -> Array:
+    """Random numbers between -1 and 1, the same in every run."""
+    found = np.random.default_rng(0).uniform(-1.0, 1.0, (nrows, ncolumns))
+    found.flags.writeable = False
+    return found
+
+
 def equations_of(job: Job, network: Network) -> Interpreted | None:
     """Equations evaluated by Python; None without blocks."""
     return Interpreted(network, job.params, (job.first, job.state), job.trials) if network.blocks else None
@@ -427,12 +441,12 @@ def on_trial(
 
 def _reason_of(attempt: Attempt[S]) -> Callable[[], str]:
     """Function that returns why the method was chosen, with a note on uncertain outputs if there are any."""
-    job, run, solver, scales = attempt.job, attempt.run, attempt.solver, attempt.scales
+    job, hull, solver, scales = attempt.job, attempt.hull, attempt.solver, attempt.scales
     t, x, time_values = attempt.visited
     reason, labels, moving = job.reason, job.prepared.output_labels, attempt.moving
     if not x.size or not np.isfinite(x).all():
         return lambda: reason
-    own = scales.with_sampled(run.states, moving).uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
+    own = scales.with_sampled(hull, moving).uncertainty(hull, job.rtol) * attempt.growth / attempt.tighter
     drift, rtol, relative, expands = attempt.drift, job.rtol, scales.relative, attempt.growth > _GROWTH
 
     def outputs(near: Array) -> Array:
