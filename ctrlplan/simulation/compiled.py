@@ -35,6 +35,9 @@ _CLOSEST, _EQUAL = 1e-8, 64.0
 """Interval between output times, in units of a segment, below which the segment is divided there (CasADi returns the
 state before an interval of less than 1e-9), unless they are equal up to so many units in the last place."""
 
+_AT_ONCE = 64
+"""Number of times up to which the memory of a function of many times is kept."""
+
 _FEW_STEPS = 2_000
 """Maximum number of steps between outputs in the first attempt."""
 
@@ -136,6 +139,7 @@ class Compiled:
         )
         self._integrators: Lru[tuple[object, ...], Segment] = Lru(_CACHE_SIZE)
         self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
+        self._small: Lru[tuple[int, str, int], _AtMany] = Lru(_CACHE_SIZE)
         self._equations: dict[tuple[int, bool], dict[str, ca.SX]] = {}
 
     def __getstate__(self) -> dict[str, object]:
@@ -218,7 +222,8 @@ class Compiled:
 
     def motion(self, t: float, x: Array, time_values: Array, p: Array) -> Motion:
         """Rates of motion by the equations linearised at a state."""
-        jacobian = _called(self._jacobian, (np.array([t]), x, time_values, p), self.moving.size)
+        n = self.moving.size
+        jacobian = self.slopes(np.array([t]), x[:, None], time_values[:, None], p).reshape(n, n, order="F")
         if not np.isfinite(jacobian).all():
             return Motion(np.inf, np.inf)
         return Motion(float(np.linalg.norm(jacobian)), -float(np.linalg.eigvals(jacobian).real.min()))
@@ -255,9 +260,14 @@ class Compiled:
         function = self._functions[name]
         if not function.numel_out(0):  # no signals without inputs and outputs
             return np.zeros((0, t.size))
-        at_all = self._maps.get((name, t.size), lambda: function.map(t.size))
-        repeated = np.repeat(p[:, None], t.size, axis=1) if p.size else p
-        return _called(at_all, (t, x, time_values, repeated), function.numel_out(0))
+        if t.size > _AT_ONCE:
+            at_all = _AtMany(self._maps.get((name, t.size), lambda: function.map(t.size)), t.size)
+        else:
+            key = threading.get_ident(), name, t.size
+            at_all = self._small.get(key, lambda: _AtMany(function.map(t.size), t.size))
+            if at_all.is_running:  # a handler of a signal may simulate
+                at_all = _AtMany(function.map(t.size), t.size)
+        return at_all.values(t, x, time_values, p)
 
     def _segment_equations(self, width: int, harmonic: bool) -> dict[str, ca.SX]:
         """Equations of scaled states over s in [0, 1], with functions of time as sums of a number of terms.
@@ -539,18 +549,31 @@ class _SegmentError(Exception):
 _ONLY_END = np.ones(1)
 
 
-def _called(function: ca.Function, arguments: Sequence[Array], nrows: int) -> Array:
-    """First result (nrows, n) of a function, without conversion through CasADi matrices."""
-    out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
-    given: tuple[Value, Callable[[], None]] = function.buffer()  # not in the type stubs of CasADi
-    buffer, evaluate = given
-    columns = [values.ravel(order="F").astype(float, copy=False) for values in arguments]
-    for k, values in enumerate(columns):
-        if values.size:
-            buffer.set_arg(k, values.data)
-    buffer.set_res(0, out.data)
-    evaluate()
-    return out.T
+class _AtMany:
+    """Function of (t, x, time_values, p) mapped over some times, with memory for its arguments, for one thread."""
+
+    def __init__(self, function: ca.Function, count: int) -> None:
+        given: tuple[Value, Callable[[], None]] = function.buffer()  # not in the type stubs of CasADi
+        self._buffer, self._evaluate = given
+        self._arguments = [np.empty((count, function.numel_in(k) // count)) for k in range(function.n_in())]
+        self._found = np.empty((count, function.numel_out(0) // count))
+        self.is_running = False
+        for k, values in enumerate(self._arguments):
+            if values.size:
+                self._buffer.set_arg(k, values.data)
+        self._buffer.set_res(0, self._found.data)
+
+    def values(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
+        """First result (nrows, ntime)."""
+        self.is_running = True
+        try:
+            for place, values in zip(self._arguments, (t[:, None], x.T, time_values.T, p), strict=True):
+                if place.size:
+                    place[...] = values
+            self._evaluate()
+            return np.array(self._found.T, order="C")
+        finally:
+            self.is_running = False
 
 
 def _pattern(relative: Array) -> Array:
