@@ -314,9 +314,7 @@ class Course:
 
     def add_rounding(self, times: Array) -> None:
         """Include the rounding errors of the signals at given times, of the size of those of their largest values."""
-        largest = np.abs(known_before(self._time_signals, times)).max(axis=1, initial=0.0)
-        errors = _ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0)
-        self.rounding = np.maximum(self.rounding, errors)
+        self.rounding = np.maximum(self.rounding, _rounding_at(self._time_signals, times))
 
     def state(self) -> tuple[SampleTimes, list[int]]:
         """Sample times and lengths of the stored signals, for `restore`."""
@@ -340,10 +338,22 @@ def _new_course(
     """Course of a run that continues none."""
     course = Course(network, solver, time_signals, span, resolution)
     endless = equations is not None and network.delays_feed_delays(equations.feeds)
-    everything = [*breakpoints_of(time_signals, *span), *network.breakpoints, *marks]
-    course.prolong(_fixed(everything, *span, course.memory.delays, _MARKS if endless else _HOPS), *span)
-    course.add_rounding(np.union1d(np.linspace(*span, 257), course.schedule.marks))
+
+    def found() -> tuple[list[float], Array]:
+        everything = [*breakpoints_of(time_signals, *span), *network.breakpoints, *marks]
+        fixed = _fixed(everything, *span, course.memory.delays, _MARKS if endless else _HOPS)
+        return fixed, _rounding_at(time_signals, np.union1d(np.linspace(*span, 257), [*fixed, span[1]]))
+
+    fixed, rounding = time_signals.marks((span, network.breakpoints, tuple(marks)), found)
+    course.prolong(fixed, *span)
+    course.rounding = rounding
     return course
+
+
+def _rounding_at(time_signals: TimeSignals, times: Array) -> Array:
+    """Rounding errors (nsignals,) of signals, of the size of those of their largest values at given times."""
+    largest = np.abs(known_before(time_signals, times)).max(axis=1, initial=0.0)
+    return np.asarray(_ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0))
 
 
 def _lengths(network: Network, delays: list[float], duration: float, stops: bool) -> tuple[float, float, float]:

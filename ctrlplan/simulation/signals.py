@@ -246,6 +246,7 @@ class TimeSignals(tuple[TimeSignal, ...]):
     def __init__(self, signals: Iterable[TimeSignal]) -> None:
         self._values: Lru[bytes, Array] = Lru(_VALUES)
         self._series: Lru[tuple[float, float, float, bytes], list[Series]] = Lru(_SEGMENTS)
+        self._marks: Lru[tuple[object, ...], tuple[list[float], Array]] = Lru(_VALUES)
         self._fixed = all(isinstance(signal, PlanSignal) for signal in self)
 
     def at(self, times: Array) -> Array:
@@ -253,6 +254,12 @@ class TimeSignals(tuple[TimeSignal, ...]):
         if not self._fixed or times.size * self.width > _SHARED:
             return signal_values(self, times)
         return self._values.get(times.tobytes(), lambda: _read_only(signal_values(self, times)))
+
+    def marks(
+        self, key: tuple[object, ...], find: Callable[[], tuple[list[float], Array]]
+    ) -> tuple[list[float], Array]:
+        """Breakpoints of a run and rounding errors of the signals, found once for what else they depend on."""
+        return self._marks.get(key, find) if self._fixed else find()
 
     @property
     def width(self) -> int:
