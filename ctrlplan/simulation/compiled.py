@@ -35,6 +35,9 @@ _CLOSEST, _EQUAL = 1e-8, 64.0
 """Interval between output times, in units of a segment, below which the segment is divided there (CasADi returns the
 state before an interval of less than 1e-9), unless they are equal up to so many units in the last place."""
 
+_AT_ONCE = 64
+"""Number of times up to which the memory of a function of many times is kept."""
+
 _FEW_STEPS = 2_000
 """Maximum number of steps between outputs in the first attempt."""
 
@@ -69,6 +72,19 @@ class Kind(Enum):
     ADAMS = "adams", "newton"
     BDF = "bdf", "newton"
     FIXED_POINT = "adams", "functional"
+
+
+class Motion(NamedTuple):
+    """Norm of a Jacobian [1/s] and its fastest decay rate [1/s]; infinite where it is not finite."""
+
+    norm: float
+    decay: float
+
+    def kind(self, length: float) -> Kind:
+        """Kind of integration for a segment of given length [s]."""
+        if self.norm * length < _SHORT:
+            return Kind.FIXED_POINT
+        return Kind.BDF if self.decay * length > _STIFF else Kind.ADAMS
 
 
 class Compiled:
@@ -112,7 +128,8 @@ class Compiled:
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
         self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(_sparse(network.read) @ w)])
         self._functions["switches"] = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]))
-        self.compared = Compared(self._functions["switches"].numel_out(0))
+        self.nswitches = self._functions["switches"].numel_out(0)
+        self.compared = Compared(self.nswitches)
         jumps = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]), bends=False)
         self._timed = [self._of_time("switches", self._functions["switches"], network, 0)]
         self._timed += [self._of_time("jumps", jumps, network, 2)]
@@ -122,7 +139,8 @@ class Compiled:
         )
         self._integrators: Lru[tuple[object, ...], Segment] = Lru(_CACHE_SIZE)
         self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
-        self._equations: dict[int, dict[str, ca.SX]] = {}
+        self._small: Lru[tuple[int, str, int], _AtMany] = Lru(_CACHE_SIZE)
+        self._equations: dict[tuple[int, bool], dict[str, ca.SX]] = {}
 
     def __getstate__(self) -> dict[str, object]:
         """State without what can be rebuilt."""
@@ -202,14 +220,13 @@ class Compiled:
                     return f"block {block.name} cannot be traced ({wrong})"
         return ""
 
-    def kind(self, t: float, x: Array, time_values: Array, p: Array, length: float) -> Kind:
-        """Kind of integration for a segment of given length, by the equations linearised at a state."""
-        jacobian = _called(self._jacobian, (np.array([t]), x, time_values, p), self.moving.size)
+    def motion(self, t: float, x: Array, time_values: Array, p: Array) -> Motion:
+        """Rates of motion by the equations linearised at a state."""
+        n = self.moving.size
+        jacobian = self.slopes(np.array([t]), x[:, None], time_values[:, None], p).reshape(n, n, order="F")
         if not np.isfinite(jacobian).all():
-            return Kind.BDF
-        if np.linalg.norm(jacobian) * length < _SHORT:
-            return Kind.FIXED_POINT
-        return Kind.BDF if -np.linalg.eigvals(jacobian).real.min() * length > _STIFF else Kind.ADAMS
+            return Motion(np.inf, np.inf)
+        return Motion(float(np.linalg.norm(jacobian)), -float(np.linalg.eigvals(jacobian).real.min()))
 
     def integrator(self, settings: Settings) -> Segment:
         """CVODES over a segment scaled to length 1, with outputs at given times."""
@@ -234,23 +251,31 @@ class Compiled:
             "disable_internal_warnings": True,
         }
         grid = np.frombuffer(settings.grid).tolist()
+        equations = self._segment_equations(settings.width, settings.harmonic)
         with passing_interruptions():
-            made = ca.integrator("segment", "cvodes", self._segment_equations(settings.width), 0.0, grid, options)
+            made = ca.integrator("segment", "cvodes", equations, 0.0, grid, options)
         return Segment(made, self.moving.size)
 
     def _at_many(self, name: str, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         function = self._functions[name]
         if not function.numel_out(0):  # no signals without inputs and outputs
             return np.zeros((0, t.size))
-        at_all = self._maps.get((name, t.size), lambda: function.map(t.size))
-        return _called(at_all, (t, x, time_values, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
+        if t.size > _AT_ONCE:
+            at_all = _AtMany(self._maps.get((name, t.size), lambda: function.map(t.size)), t.size)
+        else:
+            key = threading.get_ident(), name, t.size
+            at_all = self._small.get(key, lambda: _AtMany(function.map(t.size), t.size))
+            if at_all.is_running:  # a handler of a signal may simulate
+                at_all = _AtMany(function.map(t.size), t.size)
+        return at_all.values(t, x, time_values, p)
 
-    def _segment_equations(self, width: int) -> dict[str, ca.SX]:
-        """Equations of scaled states over s in [0, 1], with functions of time as Chebyshev series of given width.
+    def _segment_equations(self, width: int, harmonic: bool) -> dict[str, ca.SX]:
+        """Equations of scaled states over s in [0, 1], with functions of time as sums of a number of terms.
 
-        The states of sampled blocks, which are constant, are among the parameters.
+        The states of sampled blocks, which are constant, are among the parameters. Terms are Chebyshev polynomials, or
+        harmonics; the fourth number of `span` is then their rate instead of the end of the series.
         """
-        if width not in self._equations:
+        if (width, harmonic) not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
             moving = self.moving.tolist()
             shapes = {"s": (1,), "z": (len(moving),), "p": (np_,), "c": (nd, width), "bounds": (nd, 2)}
@@ -260,17 +285,22 @@ class Compiled:
             x[moving] = shift + scale * z
             left, length, first, last, earliest, latest = (span[k] for k in range(6))
             t = ca.fmin(ca.fmax(left + s * length, earliest), latest)
-            time_values = _series(c, (2.0 * t - first - last) / (last - first))
+            terms = (
+                _harmonics(last * (t - first), width)
+                if harmonic
+                else _chebyshev(2.0 * t - first - last, last - first, width)
+            )
+            time_values = c @ terms
             if width > 1:  # nan is preserved
                 time_values = ca.if_else(time_values < bounds[:, 0], bounds[:, 0], time_values)
                 time_values = ca.if_else(time_values > bounds[:, 1], bounds[:, 1], time_values)
-            self._equations[width] = {
+            self._equations[width, harmonic] = {
                 "t": s,
                 "x": z,
                 "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), shift, scale, span, start),
                 "ode": length * self._rates(t, x, time_values, p)[moving] / scale,
             }
-        return self._equations[width]
+        return self._equations[width, harmonic]
 
     def _own_parameters(self, p: ca.SX) -> list[ca.SX]:
         """Entries of p for each block."""
@@ -280,9 +310,10 @@ class Compiled:
 
 
 class Settings(NamedTuple):
-    """What an integrator of a segment is built for: terms of the series, output times (bytes), CVODES."""
+    """What an integrator of a segment is built for: terms of the functions of time, output times (bytes), CVODES."""
 
     width: int
+    harmonic: bool
     grid: bytes
     kind: Kind
     rtol: float
@@ -361,6 +392,7 @@ class CompiledSolver:
         self._shift, self._scale = scales.shift[self.moving], scales.scale[self.moving]
         self._tolerances = float(tolerances.rtol.min(initial=1.0)), tolerances.atol
         self._longest, self._kind, self._segments, self._patterns = 0.0, Kind.ADAMS, 0, 0
+        self._motion = Motion(0.0, 0.0)
         self._counts = equations.compared.is_expected
         self._series: Series | None = None
         self._known = np.empty(0)
@@ -423,32 +455,38 @@ class CompiledSolver:
     def _advanced(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """The same for times that are not too close together."""
         moving = self.form.moving
-        out = np.empty((state.size, grid.size))
-        out[:] = state[:, None]
         if not moving.size:
-            return out
+            return np.repeat(state[:, None], grid.size, axis=1)
         right = float(grid[-1])
+        if self._segments % _KIND_KEPT == 0:
+            self._motion = self.form.motion(left, state, series(left), self._p)
         if right - left > self._longest or self._segments % _KIND_KEPT == 0:
             self._longest = max(self._longest, right - left)
-            self._kind = self.form.kind(left, state, series(left), self._p, self._longest)
+            self._kind = self._motion.kind(self._longest)
         self._segments += 1
         relative = _ONLY_END if grid.size == 1 else _pattern((grid - left) / (right - left))
         settings = self._settings(series, relative)
         if self._is_rare(settings, grid.size):
-            for k in range(grid.size):
-                out[:, k] = self._advanced(series, left, grid[k : k + 1], state)[:, 0]
-            return out
+            each = [self._advanced(series, left, grid[k : k + 1], state) for k in range(grid.size)]
+            return np.concatenate(each, axis=1)
         if series is not self._series:
-            parts = [self._p, series.coefficients.ravel(order="F"), series.low, series.high, self._shift, self._scale]
+            parts = [self._p, _terms(series).ravel(order="F"), series.low, series.high, self._shift, self._scale]
             self._known, self._series = np.concatenate(parts), series
-        span = (left, right - left, series.left, series.right, *within(left, right, self.switches))
+        last = series.right if series.harmonics is None else series.harmonics.rate
+        span = (left, right - left, series.left, last, *within(left, right, self.switches))
         start = (state[moving] - self._shift) / self._scale
         try:
             found = self._solved(settings, (start, self._known, span, state), relative)
         except _SegmentError as error:
             why = f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {error}"
             raise SolverError(why) from None
-        out[moving] = self._shift[:, None] + self._scale[:, None] * found
+        found = np.array(found, order="C")  # each state contiguous: reductions over time are then fast
+        found *= self._scale[:, None]
+        found += self._shift[:, None]
+        if moving.size == state.size:
+            return found
+        out = np.repeat(state[:, None], grid.size, axis=1)
+        out[moving] = found
         return out
 
     def count(self) -> None:
@@ -459,8 +497,10 @@ class CompiledSolver:
         # Equations that depend on time are evaluated at least once per sample, so that no pulse is skipped.
         longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self.form.depends_on_time else 0.0
         allowed = min(_FEW_STEPS, self._max_steps)
-        width = series.coefficients.shape[1]
-        return Settings(width, relative.tobytes(), self._kind, *self._tolerances, allowed, longest)
+        width = _terms(series).shape[1]
+        return Settings(
+            width, series.harmonics is not None, relative.tobytes(), self._kind, *self._tolerances, allowed, longest
+        )
 
     def _is_rare(self, settings: Settings, count: int) -> bool:
         """Whether a pattern of some output times is integrated to each of them, without an integrator of its own."""
@@ -509,18 +549,31 @@ class _SegmentError(Exception):
 _ONLY_END = np.ones(1)
 
 
-def _called(function: ca.Function, arguments: Sequence[Array], nrows: int) -> Array:
-    """First result (nrows, n) of a function, without conversion through CasADi matrices."""
-    out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
-    given: tuple[Value, Callable[[], None]] = function.buffer()  # not in the type stubs of CasADi
-    buffer, evaluate = given
-    columns = [np.ravel(values, order="F").astype(float) for values in arguments]
-    for k, values in enumerate(columns):
-        if values.size:
-            buffer.set_arg(k, values.data)
-    buffer.set_res(0, out.data)
-    evaluate()
-    return out.T
+class _AtMany:
+    """Function of (t, x, time_values, p) mapped over some times, with memory for its arguments, for one thread."""
+
+    def __init__(self, function: ca.Function, count: int) -> None:
+        given: tuple[Value, Callable[[], None]] = function.buffer()  # not in the type stubs of CasADi
+        self._buffer, self._evaluate = given
+        self._arguments = [np.empty((count, function.numel_in(k) // count)) for k in range(function.n_in())]
+        self._found = np.empty((count, function.numel_out(0) // count))
+        self.is_running = False
+        for k, values in enumerate(self._arguments):
+            if values.size:
+                self._buffer.set_arg(k, values.data)
+        self._buffer.set_res(0, self._found.data)
+
+    def values(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
+        """First result (nrows, ntime)."""
+        self.is_running = True
+        try:
+            for place, values in zip(self._arguments, (t[:, None], x.T, time_values.T, p), strict=True):
+                if place.size:
+                    place[...] = values
+            self._evaluate()
+            return np.array(self._found.T, order="C")
+        finally:
+            self.is_running = False
 
 
 def _pattern(relative: Array) -> Array:
@@ -634,10 +687,26 @@ def _sparse(matrix: ArrayLike) -> ca.DM:
     return ca.sparsify(ca.DM(np.asarray(matrix, dtype=float)))
 
 
-def _series(coefficients: ca.SX, u: ca.SX) -> ca.SX:
-    """Chebyshev series (nsignals, width) at u; the polynomials are shared by all signals."""
-    width = coefficients.shape[1]
+def _terms(series: Series) -> Array:
+    """Coefficients (nsignals, width) of the functions of time of a segment: of harmonics if they are known."""
+    return series.coefficients if series.harmonics is None else series.harmonics.coefficients
+
+
+def _chebyshev(numerator: ca.SX, length: ca.SX, width: int) -> ca.SX:
+    """Chebyshev polynomials (width,) at numerator / length."""
+    u = numerator / length
+    twice = 2.0 * u
     values = [ca.SX(1), u]
     while len(values) < width:
-        values.append(2.0 * u * values[-1] - values[-2])
-    return coefficients @ ca.vertcat(*values[:width])
+        values.append(twice * values[-1] - values[-2])
+    return ca.vertcat(*values[:width])
+
+
+def _harmonics(angle: ca.SX, width: int) -> ca.SX:
+    """Terms (width,) of `Harmonics` at an angle."""
+    c1, s1 = ca.cos(angle), ca.sin(angle)
+    c, s, values = c1, s1, [ca.SX(1)]
+    while len(values) < width:
+        values += [c, s]
+        c, s = c * c1 - s * s1, s * c1 + c * s1
+    return ca.vertcat(*values)

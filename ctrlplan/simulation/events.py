@@ -14,6 +14,10 @@ from scipy.optimize import brentq
 
 from ctrlplan._types import Array, EventName
 
+_BEFORE, _NEWTON, _STEPS = 5, 6, 5
+"""Number of samples before a crossing by which it is extrapolated, steps to the root of their polynomial, and maximum
+number of values near it before the interval of the samples is searched."""
+
 Signal = Callable[[Array, Array, Array, Array], Array]
 """(t, x, u, y) at many times, time last -> values (ntime,)."""
 Events: TypeAlias = Sequence["Event"] | None
@@ -180,6 +184,7 @@ def crossings(
                 float(times[k + 1]),
                 float(values[k]) - level,
                 float(values[k + 1]) - level,
+                _expected(times, values, k, level),
             )
             if left != before:  # both limits within a rounding error of time
                 time = max(time, found[-1].time)
@@ -235,8 +240,40 @@ def _row(kind: str, row: int, seen: Snapshot) -> Array:
     return np.asarray(getattr(seen, kind)[row])
 
 
-def _root(function: Callable[[float], float], left: float, right: float, at_left: float, at_right: float) -> float:
-    """Root of a function, rounded to the side on which it is at `right`."""
+def _expected(times: Array, values: Array, k: int, level: float) -> tuple[float, float]:
+    """Time at which a signal is expected to be at a level after times[k], and its slope there.
+
+    By the polynomial through the last samples before, as there may be a kink at the level.
+    """
+    first = max(0, k + 1 - _BEFORE) if k else 0
+    last = max(k, 1)
+    t, terms = (times[first : last + 1] - times[k]).tolist(), (values[first : last + 1] - level).tolist()
+    for n in range(1, len(t)):  # divided differences
+        for j in range(len(t) - 1, n - 1, -1):
+            terms[j] = (terms[j] - terms[j - 1]) / (t[j] - t[j - n])
+    at, slope = 0.0, math.nan
+    for _ in range(_NEWTON):
+        value, slope = terms[-1], 0.0
+        for node, term in zip(t[-2::-1], terms[-2::-1], strict=True):
+            value, slope = term + (at - node) * value, value + (at - node) * slope
+        if not slope:
+            return math.nan, math.nan
+        at -= value / slope
+    return float(times[k]) + at, slope
+
+
+def _root(
+    function: Callable[[float], float],
+    left: float,
+    right: float,
+    at_left: float,
+    at_right: float,
+    expected: tuple[float, float],
+) -> float:
+    """Root of a function, rounded to the side on which it is at `right`.
+
+    It is first searched near an expected root with a slope.
+    """
     if at_left == 0.0 or at_left * at_right >= 0.0:
         return left if at_left == 0.0 else right
     crossed = [right]
@@ -249,5 +286,33 @@ def _root(function: Callable[[float], float], left: float, right: float, at_left
             crossed.append(t)
         return found
 
-    brentq(value, left, right, xtol=1e-15 * max(abs(left), abs(right), right - left), rtol=1e-14)
+    size = max(abs(left), abs(right), right - left)
+    near = _near(value, left, right, at_right, *expected, 1e-12 * (right - left) + 1e-14 * size)
+    if near is not None:
+        return near
+    brentq(value, left, right, xtol=1e-15 * size, rtol=1e-14)
     return min(crossed)
+
+
+def _near(
+    value: Callable[[float], float],
+    left: float,
+    right: float,
+    at_right: float,
+    t: float,
+    slope: float,
+    tolerance: float,
+) -> float | None:
+    """Root near t within a tolerance, on the side of `right`; None if it is not found in a few steps."""
+    for _ in range(_STEPS):
+        if not left < t < right or not slope * at_right > 0.0:
+            return None
+        found = value(t)
+        change = found / slope
+        if abs(change) > tolerance:
+            t -= change
+        elif found * at_right >= 0.0:
+            return t
+        else:
+            t += 2.0 * abs(change) + float(np.spacing(t))
+    return None

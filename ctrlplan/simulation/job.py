@@ -108,8 +108,14 @@ class Record:
         Maps k and a time between times[k] and the next to the state there.
     watched : tuple of Watched
         Signals with limits that are events.
-    method, reason : str
-        Name of the method used, and why it was chosen.
+    method : str
+        Name of the method used.
+    reason : str or callable
+        Why it was chosen; a function without arguments returns it when it is first
+        read.
+    is_pure : bool
+        Whether signals can be evaluated later, as they do not call functions of
+        blocks.
     inside : callable or None
         The same as `snapshot` to rounding, faster at one time.
     """
@@ -120,7 +126,8 @@ class Record:
     interpolate: Callable[[int, float], Array]
     watched: tuple[Watched, ...]
     method: str
-    reason: str
+    reason: str | Callable[[], str]
+    is_pure: bool = False
     inside: Callable[[Array, Array], Snapshot] | None = None
 
     def snapshot_at(self, k: int, t: float) -> Snapshot:

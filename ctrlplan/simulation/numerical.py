@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -18,9 +18,18 @@ from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.job import Job, Record, fresh_job, with_event_times
 from ctrlplan.simulation.network import Network
-from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, effects, output_uncertainty, remaining, rounding_of
+from ctrlplan.simulation.scales import (
+    PASSES,
+    Scales,
+    Tolerances,
+    effects,
+    growth_rates,
+    output_uncertainty,
+    remaining,
+    rounding_of,
+)
 from ctrlplan.simulation.segments import NetworkRun, Solver, integrate, known_before
-from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
+from ctrlplan.simulation.signals import TimeSignals, breakpoints_of
 from ctrlplan.symbolic.isolation import untouched
 
 VISITED = 12
@@ -100,7 +109,7 @@ def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     attempt = Attempt(job, method, scales)
     attempt.go()
     for _ in range(PASSES - 1 if job.atol is None else 0):
-        found = scales.renewed(attempt.run.states, attempt.moving, attempt.noise, attempt.passed_on)
+        found = scales.renewed(attempt.hull, attempt.moving, attempt.noise, attempt.passed_on)
         if found is None:
             break
         following = Attempt(fresh, method, found)
@@ -148,7 +157,7 @@ def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
         return attempt
     try:
         scales = attempt.scales.with_closer_states(
-            attempt.run.states,
+            attempt.hull,
             loose,
             attempt.noise(),
             attempt.solver.evaluations if attempt.solver.relative_by_state else None,
@@ -157,7 +166,7 @@ def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
         again.solver.count()
         again.go()
     except SolverError:
-        own = attempt.scales.uncertainty(attempt.run.states, attempt.job.rtol)
+        own = attempt.scales.uncertainty(attempt.hull, attempt.job.rtol)
         attempt.drift = np.zeros(own.size)
         attempt.drift[attempt.moving] = own[attempt.moving] @ attempt.effects.T
         return attempt
@@ -179,7 +188,7 @@ class Attempt(Generic[S]):
         Factor by which the tolerances of a step are reduced.
     growth : float
         Growth of a perturbation of the initial state.
-    time_signals : list of TimeSignal
+    time_signals : TimeSignals
         Inputs, then outputs of blocks that are functions of time.
     copies : Network
         Network for trial calls, with copies of blocks that have memory.
@@ -191,7 +200,7 @@ class Attempt(Generic[S]):
     tighter: float = 1.0
     growth: float = 1.0
     drift: Array | float = 0.0
-    time_signals: list[TimeSignal] = field(init=False)
+    time_signals: TimeSignals = field(init=False)
     watched: tuple[Watched, ...] = field(init=False)
     copies: Network = field(init=False)
     solver: S = field(init=False)
@@ -235,7 +244,7 @@ class Attempt(Generic[S]):
 
     def loose(self) -> NDArray[np.bool_]:
         """States (nstates,) whose tolerances are too large for the accuracy of other states."""
-        states, scales, moving = self.run.states, self.scales, self.moving
+        states, scales, moving = self.hull, self.scales, self.moving
         loose = np.zeros(len(states), dtype=bool)
         if moving.size < 2 or not np.isfinite(states).all():
             return loose
@@ -254,6 +263,12 @@ class Attempt(Generic[S]):
         loose[moving] = found.any(axis=0)
         return loose
 
+    @cached_property
+    def hull(self) -> Array:
+        """States (nstates, 3): initial ones, minima and maxima of the run, nan where a state is."""
+        states = self.run.states
+        return np.stack([states[:, 0], states.min(axis=1), states.max(axis=1)], axis=1)
+
     @property
     def moving(self) -> NDArray[np.intp]:
         """Indices of the states that are integrated."""
@@ -262,7 +277,12 @@ class Attempt(Generic[S]):
     @cached_property
     def effects(self) -> Array:
         """Largest displacement of each integrated state by a unit error of another, shape (nmoving, nmoving)."""
-        return effects(self._slopes, float(self.run.times[-1] - self.run.times[0]))
+        return effects(self._slopes, float(self.run.times[-1] - self.run.times[0]), self._growth_rates)
+
+    @cached_property
+    def _growth_rates(self) -> Array:
+        """Largest growth rates of perturbations at the points of `_slopes`; nan where they are not finite."""
+        return growth_rates(self._slopes)
 
     @cached_property
     def _slopes(self) -> Array:
@@ -270,49 +290,18 @@ class Attempt(Generic[S]):
         t, x, time_values = self.visited
         some = slice(None, None, VISITED // _DISPLACED)
         # At samples that are full turns of an angle apart, the slope of its sine is the same and may be 0.
-        displaced = x[:, some] * (1.0 + _JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, x[:, some].shape))
+        displaced = x[:, some] * (1.0 + _JITTER * _random(*x[:, some].shape))
         places = (
             np.append(t, t[some]),
             np.append(x, displaced, axis=1),
             np.append(time_values, time_values[:, some], axis=1),
         )
-        return self.on_trial(self.solver.slopes, *places, (-1, self.moving.size, self.moving.size))
-
-    def on_trial(
-        self,
-        function: Callable[[Array, Array, Array], Array],
-        t: Array,
-        x: Array,
-        time_values: Array,
-        shape: tuple[int, ...],
-    ) -> Array:
-        """Values of a function at states that a run may not have reached; nan where blocks raise.
-
-        In `shape`, that of the result, -1 is the axis of the times.
-        """
-        if not self.solver.calls_blocks:
-            return function(t, x, time_values)
-        axis, empty = shape.index(-1), np.full([abs(size) for size in shape], np.nan)
-
-        def at(some: slice) -> Array | None:
-            try:
-                return function(t[some], x[:, some], time_values[:, some])
-            except (KeyboardInterrupt, TimeLimitError):
-                raise
-            except BaseException:  # outside the domain of a block, as a perturbed argument may be
-                return None
-
-        with untouched():
-            whole = at(slice(None))
-            if whole is not None:
-                return whole
-            found = [at(slice(k, k + 1)) for k in range(t.size)]
-        return np.concatenate([empty if part is None else part for part in found], axis=axis)
+        return on_trial(self.solver, self.solver.slopes, *places, (-1, self.moving.size, self.moving.size))
 
     def record(self) -> Record:
         """Record of the run, with a note on its accuracy if that is insufficient."""
-        said = _accuracy_note(self)
-        reason = f"{self.job.reason}; {said}" if said else self.job.reason
+        is_pure = not self.solver.calls_blocks
+        reason = _reason_of(self)
         return Record(
             self.run.times,
             self.run.states,
@@ -320,17 +309,17 @@ class Attempt(Generic[S]):
             self._state_at,
             self.watched,
             self.method.name,
-            reason,
+            reason if is_pure else reason(),
+            is_pure,
             self._snapshot_inside,
         )
 
     def expands(self) -> bool:
         """Whether neighbouring solutions may diverge, by the largest growth rate along the run."""
         t = self.visited[0]
-        slopes = self._slopes[: t.size]
-        if t.size < 2 or not slopes.size or not np.isfinite(slopes).all():
+        rates = self._growth_rates[: t.size]
+        if t.size < 2 or not self._slopes.size or not np.isfinite(rates).all():
             return False
-        rates = np.maximum(np.linalg.eigvals(slopes).real.max(axis=1), 0.0)
         return float(trapezoid(rates, t)) > math.log(_GROWTH)
 
     @property
@@ -347,7 +336,8 @@ class Attempt(Generic[S]):
         t, x, time_values = self.visited
         duration = float(self.run.times[-1] - self.run.times[0])
         shape = (len(x), -1)
-        return duration * rounding_of(lambda near: self.on_trial(self.solver.rates, t, near, time_values, shape), x)
+        rates = partial(on_trial, self.solver, self.solver.rates)
+        return duration * rounding_of(lambda near: rates(t, near, time_values, shape), x)
 
     def passed_on(self, errors: Array) -> Array:
         """Errors (nstates,) of the integrated states caused by errors of others."""
@@ -360,30 +350,25 @@ class Attempt(Generic[S]):
         """Some times and states of the run, and the values of the functions of time."""
         some = np.unique(np.linspace(0, self.run.times.size - 1, VISITED).astype(int))
         t = self.run.times[some]
-        return t, self.run.states[:, some], signal_values(self.time_signals, t)
+        return t, self.run.states[:, some], self.time_signals.at(t)
 
     def time_values(self, t: Array) -> Array:
         """Values (nsignals, ntime) of the functions of time; those of the last call if the times are the same."""
         if self._last is None or not np.array_equal(t, self._last[0]):
-            self._last = t, signal_values(self.time_signals, t)
+            self._last = t, self.time_signals.at(t)
         return self._last[1]
 
     def _snapshot(self, t: Array, x: Array) -> Snapshot:
-        return self._seen(t, x, self.time_values(t))
+        ninputs = self.job.prepared.ninputs
+        if not ninputs:
+            return _seen(self.solver, t, x, np.zeros((0, t.size)), partial(self.time_signals.at, t))
+        known = self.time_values(t)  # the caller may change samples later
+        return _seen(self.solver, t, x, known[:ninputs], lambda: known)
 
     def _snapshot_inside(self, t: Array, x: Array) -> Snapshot:
         """Snapshot at one time, with the series of the functions of time."""
-        return self._seen(t, x, self.run.series(float(t[0]))(float(t[0]))[:, None])
-
-    def _seen(self, t: Array, x: Array, time_values: Array) -> Snapshot:
-        solver = self.solver
-        return Snapshot(
-            t,
-            x,
-            time_values[: self.job.prepared.ninputs],
-            lambda: solver.outputs(t, x, time_values),
-            lambda: solver.signals(t, x, time_values),
-        )
+        known = self.run.series(float(t[0]))(float(t[0]))[:, None]
+        return _seen(self.solver, t, x, known[: self.job.prepared.ninputs], lambda: known)
 
     def _state_at(self, k: int, t: float) -> Array:
         start = float(self.run.times[k])
@@ -400,8 +385,16 @@ class Attempt(Generic[S]):
         """Jacobian by the states at the start of the run; nan where blocks raise."""
         t, n = self.job.times[:1], self.job.state.size
         with np.errstate(all="ignore"):
-            values = signal_values(self.time_signals, t)
-            return np.asarray(self.on_trial(self.solver.slopes, t, self.job.state[:, None], values, (-1, n, n))[0])
+            places = t, self.job.state[:, None], self.time_signals.at(t)
+            return np.asarray(on_trial(self.solver, self.solver.slopes, *places, (-1, n, n))[0])
+
+
+@lru_cache(maxsize=32)
+def _random(nrows: int, ncolumns: int) -> Array:
+    """Random numbers between -1 and 1, the same in every run."""
+    found = np.random.default_rng(0).uniform(-1.0, 1.0, (nrows, ncolumns))
+    found.flags.writeable = False
+    return found
 
 
 def equations_of(job: Job, network: Network) -> Interpreted | None:
@@ -409,35 +402,78 @@ def equations_of(job: Job, network: Network) -> Interpreted | None:
     return Interpreted(network, job.params, (job.first, job.state), job.trials) if network.blocks else None
 
 
-def _accuracy_note(attempt: Attempt[S]) -> str:
-    """Note on uncertain outputs with the tolerance that suffices; empty if there are none."""
-    job, run, solver, scales = attempt.job, attempt.run, attempt.solver, attempt.scales
+def _seen(solver: NumericalSolver, t: Array, x: Array, u: Array, time_values: Callable[[], Array]) -> Snapshot:
+    """Snapshot of a run."""
+    return Snapshot(t, x, u, lambda: solver.outputs(t, x, time_values()), lambda: solver.signals(t, x, time_values()))
+
+
+def on_trial(
+    solver: NumericalSolver,
+    function: Callable[[Array, Array, Array], Array],
+    t: Array,
+    x: Array,
+    time_values: Array,
+    shape: tuple[int, ...],
+) -> Array:
+    """Values of a function at states that a run may not have reached; nan where blocks raise.
+
+    In `shape`, that of the result, -1 is the axis of the times.
+    """
+    if not solver.calls_blocks:
+        return function(t, x, time_values)
+    axis, empty = shape.index(-1), np.full([abs(size) for size in shape], np.nan)
+
+    def at(some: slice) -> Array | None:
+        try:
+            return function(t[some], x[:, some], time_values[:, some])
+        except (KeyboardInterrupt, TimeLimitError):
+            raise
+        except BaseException:  # outside the domain of a block, as a perturbed argument may be
+            return None
+
+    with untouched():
+        whole = at(slice(None))
+        if whole is not None:
+            return whole
+        found = [at(slice(k, k + 1)) for k in range(t.size)]
+    return np.concatenate([empty if part is None else part for part in found], axis=axis)
+
+
+def _reason_of(attempt: Attempt[S]) -> Callable[[], str]:
+    """Function that returns why the method was chosen, with a note on uncertain outputs if there are any."""
+    job, hull, solver, scales = attempt.job, attempt.hull, attempt.solver, attempt.scales
     t, x, time_values = attempt.visited
+    reason, labels, moving = job.reason, job.prepared.output_labels, attempt.moving
     if not x.size or not np.isfinite(x).all():
-        return ""
-    known = scales.with_sampled(run.states, attempt.moving)
-    own = known.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
-    uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
+        return lambda: reason
+    own = scales.with_sampled(hull, moving).uncertainty(hull, job.rtol) * attempt.growth / attempt.tighter
+    drift, rtol, relative, expands = attempt.drift, job.rtol, scales.relative, attempt.growth > _GROWTH
 
     def outputs(near: Array) -> Array:
         copies = near.shape[1] // t.size
         places = np.tile(t, copies), near, np.tile(time_values, copies)
-        return attempt.on_trial(solver.outputs, *places, (count, -1))
+        return on_trial(solver, solver.outputs, *places, (len(labels), -1))
 
-    worst, ranges = output_uncertainty(outputs, x, uncertainty, attempt.moving)
-    allowed = max(_UNCERTAIN, 100.0 * job.rtol) * ranges
-    uncertain = (ranges > 0.0) & (worst > allowed)
-    if not uncertain.any():
-        return ""
-    part = np.where(uncertain, worst / np.where(uncertain, ranges, 1.0), 0.0)
-    names = ", ".join(np.array(job.prepared.output_labels)[uncertain])
-    needed = job.rtol * _UNCERTAIN / float(part.max())
-    what = "are differences of larger terms" if attempt.growth <= _GROWTH else "diverge from neighbouring solutions"
-    if np.any(attempt.drift > own):
-        what = "depend on small fractions of large states"
-    advice = (
-        f"rtol = {needed:.0e} suffices for {_UNCERTAIN:.0e}"
-        if needed > 1e-12 / scales.relative.min()
-        else "no tolerance suffices"
-    )
-    return f"outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: {advice}"
+    def found() -> str:
+        worst, ranges = output_uncertainty(outputs, x, own + drift, moving)
+        allowed = max(_UNCERTAIN, 100.0 * rtol) * ranges
+        uncertain = (ranges > 0.0) & (worst > allowed)
+        if not uncertain.any():
+            return reason
+        part = np.where(uncertain, worst / np.where(uncertain, ranges, 1.0), 0.0)
+        names = ", ".join(np.array(labels)[uncertain])
+        needed = rtol * _UNCERTAIN / float(part.max())
+        what = "diverge from neighbouring solutions" if expands else "are differences of larger terms"
+        if np.any(drift > own):
+            what = "depend on small fractions of large states"
+        advice = (
+            f"rtol = {needed:.0e} suffices for {_UNCERTAIN:.0e}"
+            if needed > 1e-12 / relative.min()
+            else "no tolerance suffices"
+        )
+        return (
+            f"{reason}; outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: "
+            f"{advice}"
+        )
+
+    return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -26,12 +26,13 @@ from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Block, Network, UnsupportedError, structure
 from ctrlplan.simulation.sampled_form import DelayedForm, SampledForm, delayed_form, sampled_form
 from ctrlplan.simulation.segments import DelayedSignal
-from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
+from ctrlplan.simulation.signals import PlanSignal, TimeSignal, TimeSignals, signal_values
 from ctrlplan.simulation.starts import command_starts
 from ctrlplan.simulation.unread import is_read
 from ctrlplan.symbolic import missing_casadi
 from ctrlplan.symbolic.fingerprint import array_token, fingerprint, value_token
 from ctrlplan.symbolic.keeper import Keeper
+from ctrlplan.symbolic.references import Same
 from ctrlplan.traits import traits_of
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from ctrlplan.symbolic.tracing import Trace
 
 _CACHE_SIZE = 16
-"""Number of systems whose forms `simulate` caches."""
+"""Number of systems whose forms `simulate` caches, and of plans of each whose values are shared by runs."""
 
 
 class Prepared(Displayed):
@@ -94,6 +95,7 @@ class Prepared(Displayed):
                 self.not_sampled = str(error)
                 self._use_delays(self.network)
         self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
+        self._planned: Lru[tuple[tuple[Same, int], ...], TimeSignals] = Lru(_CACHE_SIZE)
         self._built_forms = BuiltForms()
         self.starts = command_starts(self._blocks())
 
@@ -149,8 +151,15 @@ class Prepared(Displayed):
         """
         return self.network is not None and bool(self.network.blocks)
 
-    def time_signals(self, inputs: list[TimeSignal], first: float) -> list[TimeSignal]:
-        """Input signals, then outputs of blocks that are functions of time."""
+    def time_signals(self, inputs: Sequence[TimeSignal], first: float) -> TimeSignals:
+        """Input signals, then outputs of blocks that are functions of time; the same object for the same plans."""
+        delays = any(block.delay is not None for block in self._blocks())
+        if delays or not all(isinstance(signal, PlanSignal) for signal in inputs):
+            return TimeSignals(self._signals_in_order(inputs, first))
+        key = tuple((Same(signal.plan), signal.derivatives) for signal in inputs if isinstance(signal, PlanSignal))
+        return self._planned.get(key, lambda: TimeSignals(self._signals_in_order(inputs, first)))
+
+    def _signals_in_order(self, inputs: Sequence[TimeSignal], first: float) -> list[TimeSignal]:
         sources, found = iter(self._sources), list(inputs)
         for block in self._blocks():
             if block.plan is not None:
@@ -161,7 +170,7 @@ class Prepared(Displayed):
         return [*found, *sources]
 
     def compiled(
-        self, params: Params, time_signals: list[TimeSignal], first: float, state: Array, trials: bool = True
+        self, params: Params, time_signals: Sequence[TimeSignal], first: float, state: Array, trials: bool = True
     ) -> Compiled:
         """Compiled form, built once for all values of the parameters.
 
@@ -280,7 +289,7 @@ class Prepared(Displayed):
         return self._built_forms.reads(name, partial(is_read, network, name, value, start, at_start))
 
     def _build(
-        self, params: Params, time_signals: list[TimeSignal], first: float, state: Array, trials: bool
+        self, params: Params, time_signals: Sequence[TimeSignal], first: float, state: Array, trials: bool
     ) -> BuiltForm:
         """Compiled form of all blocks, or the reason why there is none."""
         names, network = frozenset(params), self.network
@@ -323,7 +332,7 @@ class Prepared(Displayed):
         self,
         network: Network,
         params: Params,
-        time_signals: list[TimeSignal],
+        time_signals: Sequence[TimeSignal],
         first: float,
         state: Array,
         trials: bool,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import control as ct
+import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._display import ROWS, Displayed, Facts, Part, Table, number, shortened
@@ -28,15 +29,17 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
     ----------
     time : array_like, shape (ntime,)
         Times [s].
-    outputs : array_like, shape (noutputs, ntime)
-        Outputs of the system.
+    outputs : array_like, shape (noutputs, ntime), or callable
+        Outputs of the system; a function without arguments returns them when they
+        are first read, and requires `output_labels`.
     states, inputs : array_like, shapes (nstates, ntime) and (ninputs, ntime), optional
         Its states and inputs.
     method : str, optional
         Name of the method used: "exact", "compiled" or "python".
-    reason : str, optional
+    reason : str or callable, optional
         Why that method was chosen; where an output is uncertain, also the
-        estimated error and the tolerance that suffices.
+        estimated error and the tolerance that suffices. A function without
+        arguments returns it when it is first read.
     events : sequence of Occurrence, optional
         Crossings of the limits of events, in order of time.
     **labels
@@ -66,30 +69,57 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
     """
 
     t: Array
-    y: Array
     x: Array
     u: Array
     input_labels: list[str]
     output_labels: list[str]
     state_labels: list[str]
     method: str
-    reason: str
     events: list[Occurrence]
+    _y: Array
+    _outputs: Callable[[], Array] | None = None
 
     def __init__(
         self,
         time: ArrayLike,
-        outputs: ArrayLike,
+        outputs: ArrayLike | Callable[[], Array],
         states: ArrayLike | None = None,
         inputs: ArrayLike | None = None,
         *,
         method: str = "",
-        reason: str = "",
+        reason: str | Callable[[], str] = "",
         events: Sequence[Occurrence] = (),
+        output_labels: Sequence[str] | None = None,
         **labels: object,
     ) -> None:
-        super().__init__(time, outputs, states, inputs, **labels)
-        self.method, self.reason, self.events = method, reason, list(events)
+        given = np.empty((len(output_labels or ()), np.size(time))) if callable(outputs) else outputs
+        super().__init__(time, given, states, inputs, output_labels=output_labels, **labels)
+        self._outputs = outputs if callable(outputs) else None
+        self._reason, self.method, self.events = reason, method, list(events)
+
+    @property
+    def y(self) -> Array:
+        """Outputs, (noutputs, ntime), never squeezed."""
+        evaluate = self._outputs
+        if evaluate is not None:
+            self._y, self._outputs = evaluate(), None
+        return self._y
+
+    @y.setter
+    def y(self, values: Array) -> None:
+        self._y, self._outputs = values, None
+
+    @property
+    def reason(self) -> str:
+        """Why the method was chosen, and where an output is uncertain the estimated error."""
+        found = self._reason
+        if callable(found):
+            self._reason = found = found()
+        return found
+
+    def __getstate__(self) -> dict[str, object]:
+        """State with the outputs and the reason, which are otherwise evaluated when they are read."""
+        return self.__dict__ | {"_y": self.y, "_outputs": None, "_reason": self.reason}
 
     def export(self, path: str | os.PathLike[str]) -> Path:
         """Write times and signals to a file, in the format of its ending.

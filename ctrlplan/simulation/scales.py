@@ -241,7 +241,15 @@ def output_uncertainty(
     return worst, np.ptp(plain, axis=1) if plain.shape[1] else np.zeros(len(plain))
 
 
-def effects(slopes: Array, duration: float) -> Array:
+def growth_rates(slopes: Array) -> Array:
+    """Largest growth rates (npoints,), at least 0, by Jacobians (npoints, nstates, nstates); nan where not finite."""
+    finite = np.isfinite(slopes).all(axis=(1, 2))
+    found = np.full(len(slopes), np.nan)
+    found[finite] = np.maximum(np.linalg.eigvals(slopes[finite]).real.max(axis=1, initial=0.0), 0.0)
+    return found
+
+
+def effects(slopes: Array, duration: float, growth: Array | None = None) -> Array:
     """Largest displacement of each state by a unit error of another, shape (nstates, nstates).
 
     Parameters
@@ -250,6 +258,8 @@ def effects(slopes: Array, duration: float) -> Array:
         Jacobians by the states at points of a run.
     duration : float
         Duration of the run [s].
+    growth : ndarray, shape (npoints,), optional
+        Their `growth_rates`, if these are known.
 
     Notes
     -----
@@ -258,9 +268,9 @@ def effects(slopes: Array, duration: float) -> Array:
     excluded: J is shifted so that no mode grows.
     """
     n = slopes.shape[1]
-    slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
-    growth = np.maximum(np.linalg.eigvals(slopes).real.max(axis=1, initial=0.0), 0.0)
-    matrices = (1.0 + duration * growth)[:, None, None] * np.eye(n) - duration * slopes
+    growth = growth_rates(slopes) if growth is None else growth
+    finite = np.isfinite(growth)
+    matrices = (1.0 + duration * growth[finite])[:, None, None] * np.eye(n) - duration * slopes[finite]
     found: Array = np.abs(np.linalg.solve(matrices, np.broadcast_to(np.eye(n), matrices.shape))).max(
         axis=0, initial=0.0
     )

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -24,11 +23,10 @@ from ctrlplan.simulation.signals import (
     RESOLVED,
     Series,
     TimeSignal,
+    TimeSignals,
     breakpoints_of,
     chebyshev_coefficients,
     chebyshev_times,
-    resolved,
-    straight,
 )
 
 _WIDTH = 24
@@ -175,7 +173,7 @@ def integrate(
     network: Network,
     equations: Interpreted | None,
     solver: Solver,
-    time_signals: Sequence[TimeSignal],
+    time_signals: TimeSignals,
     times: Array,
     state: Array,
     resolution: float,
@@ -189,7 +187,7 @@ def integrate(
     ----------
     network, equations, solver
         The network, its equations by Python, and the integrator.
-    time_signals : sequence of TimeSignal
+    time_signals : TimeSignals
         Signals at the inputs, then the outputs of each block that are functions of time.
     times : ndarray, shape (ntime,)
         Times of the run, from its start to its end.
@@ -231,7 +229,7 @@ def integrate(
         if memory.delays or not (span and span[-1].right >= right):
             until, accuracy = (right, resolution) if memory.delays else (schedule.fixed_after(left), RESOLVED)
             error = np.maximum(rounding, memory.rounding)
-            span = _resolved(time_signals, 0.5 * (left + right), left, until, accuracy, error)
+            span = time_signals.series(0.5 * (left + right), left, until, accuracy, error)
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
         inside = times[times.searchsorted(left) : times.searchsorted(right)]
@@ -301,14 +299,14 @@ class Course:
         self,
         network: Network,
         solver: Solver,
-        time_signals: Sequence[TimeSignal],
+        time_signals: TimeSignals,
         span: tuple[float, float],
         resolution: float,
     ) -> None:
         self._time_signals = time_signals
         self.memory = _Memory(network, solver, time_signals, resolution)
         self.schedule = _Schedule(network, time_signals, *span)
-        self.rounding: Array = np.zeros(sum(signal.width for signal in time_signals))
+        self.rounding: Array = np.zeros(time_signals.width)
 
     def prolong(self, fixed: list[float], first: float, last: float) -> None:
         """Continue to a later end, with the breakpoints before it."""
@@ -316,9 +314,7 @@ class Course:
 
     def add_rounding(self, times: Array) -> None:
         """Include the rounding errors of the signals at given times, of the size of those of their largest values."""
-        largest = np.abs(known_before(self._time_signals, times)).max(axis=1, initial=0.0)
-        errors = _ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0)
-        self.rounding = np.maximum(self.rounding, errors)
+        self.rounding = np.maximum(self.rounding, _rounding_at(self._time_signals, times))
 
     def state(self) -> tuple[SampleTimes, list[int]]:
         """Sample times and lengths of the stored signals, for `restore`."""
@@ -334,7 +330,7 @@ def _new_course(
     network: Network,
     equations: Interpreted | None,
     solver: Solver,
-    time_signals: Sequence[TimeSignal],
+    time_signals: TimeSignals,
     span: tuple[float, float],
     resolution: float,
     marks: Sequence[float],
@@ -342,10 +338,22 @@ def _new_course(
     """Course of a run that continues none."""
     course = Course(network, solver, time_signals, span, resolution)
     endless = equations is not None and network.delays_feed_delays(equations.feeds)
-    everything = [*breakpoints_of(time_signals, *span), *network.breakpoints, *marks]
-    course.prolong(_fixed(everything, *span, course.memory.delays, _MARKS if endless else _HOPS), *span)
-    course.add_rounding(np.union1d(np.linspace(*span, 257), course.schedule.marks))
+
+    def found() -> tuple[list[float], Array]:
+        everything = [*breakpoints_of(time_signals, *span), *network.breakpoints, *marks]
+        fixed = _fixed(everything, *span, course.memory.delays, _MARKS if endless else _HOPS)
+        return fixed, _rounding_at(time_signals, np.union1d(np.linspace(*span, 257), [*fixed, span[1]]))
+
+    fixed, rounding = time_signals.marks((span, network.breakpoints, tuple(marks)), found)
+    course.prolong(fixed, *span)
+    course.rounding = rounding
     return course
+
+
+def _rounding_at(time_signals: TimeSignals, times: Array) -> Array:
+    """Rounding errors (nsignals,) of signals, of the size of those of their largest values at given times."""
+    largest = np.abs(known_before(time_signals, times)).max(axis=1, initial=0.0)
+    return np.asarray(_ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0))
 
 
 def _lengths(network: Network, delays: list[float], duration: float, stops: bool) -> tuple[float, float, float]:
@@ -387,21 +395,6 @@ def _longest(network: Network, delays: list[float], duration: float) -> float:
     return min(longest, max(declared, duration / _SEGMENTS))
 
 
-def _resolved(
-    time_signals: Sequence[TimeSignal], moment: float, left: float, until: float, accuracy: float, rounding: Array
-) -> list[Series]:
-    """Series and bounds of the signals in the segment of a time."""
-    lines = [signal.ends(left, until) for signal in time_signals]
-    known = [line for line in lines if line is not None]
-    if known and len(known) == len(lines):
-        return [straight(left, until, *(np.concatenate(values) for values in zip(*known, strict=True)))]
-    signals = partial(_analytic_at, time_signals, moment, left)
-    return [
-        series.bounded(*_bounds(time_signals, moment, series.left, series.right))
-        for series in resolved(signals, left, until, accuracy, rounding)
-    ]
-
-
 class _Memory:
     """Stored inputs of the delays, segment by segment.
 
@@ -413,7 +406,7 @@ class _Memory:
         Times [s] at which jumps at the start of the last stored segment arrive.
     """
 
-    def __init__(self, network: Network, solver: Solver, time_signals: Sequence[TimeSignal], resolution: float) -> None:
+    def __init__(self, network: Network, solver: Solver, time_signals: TimeSignals, resolution: float) -> None:
         blocks = network.blocks_with("delay")
         self._time_signals = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
         self._fed = [network.fed[i] for i in blocks]
@@ -426,7 +419,7 @@ class _Memory:
             for signal, end in zip(time_signals, ends.tolist(), strict=True)
             if isinstance(signal, DelayedSignal)
         ]
-        self.rounding: Array = np.zeros(sum(signal.width for signal in time_signals))
+        self.rounding: Array = np.zeros(time_signals.width)
         self._ends: list[Array | None] = [None for _ in self._time_signals]
         self.jumps: list[float] = []
 
@@ -510,7 +503,7 @@ class _Schedule:
     considered equal; the sample then reads the values after it.
     """
 
-    def __init__(self, network: Network, time_signals: Sequence[TimeSignal], first: float, last: float) -> None:
+    def __init__(self, network: Network, time_signals: TimeSignals, first: float, last: float) -> None:
         self._time_signals, self._arrivals = time_signals, list[float]()
         self._ahead: tuple[Array, Array] = np.empty(0), np.empty((0, 0))
         self._tolerance = time_tolerance(first, last)
@@ -665,22 +658,15 @@ def as_fraction(seconds: float) -> Fraction:
     return simple if abs(float(simple) - seconds) <= 1e-15 * abs(seconds) else Fraction(seconds)
 
 
-def known_before(time_signals: Sequence[TimeSignal], times: Array) -> Array:
+def known_before(time_signals: TimeSignals, times: Array) -> Array:
     """Signals (nsignals, ntime) that are known before a run; 0 for the outputs of delays."""
+    if not any(isinstance(signal, DelayedSignal) for signal in time_signals):
+        return time_signals.at(times)
     rows = [
         np.zeros((signal.width, times.size)) if isinstance(signal, DelayedSignal) else signal.at(times)
         for signal in time_signals
     ]
     return np.concatenate([np.zeros((0, times.size)), *rows])
-
-
-def _analytic_at(time_signals: Sequence[TimeSignal], moment: float, origin: float, s: Array) -> Array:
-    return np.concatenate([np.zeros((0, s.size)), *(signal.analytic_at(moment, origin, s) for signal in time_signals)])
-
-
-def _bounds(time_signals: Sequence[TimeSignal], moment: float, left: float, right: float) -> tuple[Array, Array]:
-    found = [signal.bounds(moment, left, right) for signal in time_signals]
-    return tuple(np.concatenate([np.zeros(0), *(pair[side] for pair in found)]) for side in (0, 1))  # type: ignore[return-value]
 
 
 def _combined_bounds(wire: Array, time_rows: NDArray[np.intp], series: Series) -> tuple[Array, Array]:

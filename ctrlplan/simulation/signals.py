@@ -11,15 +11,16 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Protocol
+from functools import lru_cache, partial
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._lru import Lru
 from ctrlplan._types import Array
-from ctrlplan.trajectories import Step, Trajectory, chebyshev
+from ctrlplan.trajectories import Step, Trajectory, TrigSpline, chebyshev
 from ctrlplan.trajectories.files import signal_rows
 
 Inputs = Trajectory | ArrayLike | Mapping[str, Trajectory | ArrayLike] | None
@@ -40,8 +41,36 @@ _DENSE = np.cos(np.linspace(0.0, np.pi, 4 * WIDTHS[-1]))
 _ROUNDING = 1e-13
 """Violation of the bounds, relative to the terms of a series, that counts as rounding."""
 
+_VALUES, _SHARED, _SEGMENTS = 8, 200_000, 64
+"""Number of arrays of times of which values are shared by runs, maximum size of such values, and number of segments."""
+
+_CANCELLED = 16.0
+"""Maximum sum of the coefficients of a trigonometric sum relative to its largest value; more would cancel."""
+
 _NOISE = 1e-11
 """Relative magnitude up to which the later half of the longest series counts as rounding errors."""
+
+
+class Harmonics(NamedTuple):
+    """Sum over 1, cos(a), sin(a), cos(2 a), ..., a = rate (t - left), with coefficients (nsignals, 2 n + 1)."""
+
+    rate: float
+    coefficients: Array
+
+    @classmethod
+    def fitted(
+        cls, series: Series, rate: float, count: int, accuracy: float, rounding: Array | float
+    ) -> Harmonics | None:
+        """Sum with `count` harmonics that is equal to a series up to rounding; None if there is none."""
+        nodes = chebyshev_times(series.left, series.right, 4 * count + 2)
+        between = 0.5 * (nodes[1:] + nodes[:-1])
+        values, terms = _unclipped(series, nodes), harmonic_terms(rate * (nodes - series.left), count)
+        found: Array = np.linalg.lstsq(terms.T, values.T, rcond=1e-12)[0].T.astype(float)
+        size = np.abs(values).max(axis=1, keepdims=True)
+        if np.any(np.abs(found).sum(axis=1, keepdims=True) > _CANCELLED * size):
+            return None
+        apart = np.abs(found @ harmonic_terms(rate * (between - series.left), count) - _unclipped(series, between))
+        return cls(rate, found) if np.all(apart <= np.maximum(accuracy * size, np.reshape(rounding, (-1, 1)))) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +82,8 @@ class Series:
     low, high : ndarray, shape (nsignals,)
         Bounds to which values are clipped, since rounding may violate them;
         infinite if they are not known.
+    harmonics : Harmonics or None
+        The same signals as a trigonometric sum, if they are one with fewer terms.
     """
 
     left: float
@@ -60,6 +91,7 @@ class Series:
     coefficients: Array
     low: Array
     high: Array
+    harmonics: Harmonics | None = None
 
     def __call__(self, t: float) -> Array:
         """All signals at one time, shape (nsignals,)."""
@@ -77,6 +109,12 @@ class Series:
         u = np.clip((2.0 * times - self.left - self.right) / (self.right - self.left), -1.0, 1.0)
         values = self.coefficients @ np.cos(_counts(self.coefficients.shape[1])[:, None] * np.arccos(u))
         return np.asarray(np.clip(values, self.low[:, None], self.high[:, None]))
+
+    def with_harmonics(self, known: tuple[float, int] | None, accuracy: float, rounding: Array | float) -> Series:
+        """Same signals with their trigonometric sum of known rate and number of harmonics, if it has fewer terms."""
+        if known is None or self.coefficients.shape[1] <= 2 * known[1] + 1:
+            return self
+        return replace(self, harmonics=Harmonics.fitted(self, *known, accuracy, rounding))
 
     def bounded(self, low: Array, high: Array) -> Series:
         """Same signals with bounds, unless they violate these by more than rounding."""
@@ -147,6 +185,13 @@ class PlanSignal:
         value = self.analytic_at(0.5 * (left + right), left, np.zeros(1))[:, 0]
         return value, value
 
+    @property
+    def harmonics(self) -> tuple[float, int] | None:
+        """Rate [rad/s] and number of harmonics of a trigonometric spline; None for other plans."""
+        if not isinstance(self.plan, TrigSpline) or not self.plan.alpha:
+            return None
+        return self.plan.alpha / self.plan.duration, max(self.plan.degree)
+
     def at(self, times: Array) -> Array:
         """Values of the plan."""
         return signal_rows(self.plan, times, self.derivatives)
@@ -193,6 +238,80 @@ class SampledSignal:
         """Indices of the samples at both ends of the line that contains `moment`."""
         left = min(max(int(np.searchsorted(self._knots, moment)) - 1, 0), self._knots.size - 2)
         return self._ends[left : left + 2]
+
+
+class TimeSignals(tuple[TimeSignal, ...]):
+    """Functions of time of a run in order; their values and series are shared by runs if all of them are plans."""
+
+    def __init__(self, signals: Iterable[TimeSignal]) -> None:
+        self._values: Lru[bytes, Array] = Lru(_VALUES)
+        self._series: Lru[tuple[float, float, float, bytes], list[Series]] = Lru(_SEGMENTS)
+        self._marks: Lru[tuple[object, ...], tuple[list[float], Array]] = Lru(_VALUES)
+        self._fixed = all(isinstance(signal, PlanSignal) for signal in self)
+
+    def at(self, times: Array) -> Array:
+        """Values (nsignals, ntime), right-continuous; read-only if they are shared."""
+        if not self._fixed or times.size * self.width > _SHARED:
+            return signal_values(self, times)
+        return self._values.get(times.tobytes(), lambda: _read_only(signal_values(self, times)))
+
+    def marks(
+        self, key: tuple[object, ...], find: Callable[[], tuple[list[float], Array]]
+    ) -> tuple[list[float], Array]:
+        """Breakpoints of a run and rounding errors of the signals, found once for what else they depend on."""
+        return self._marks.get(key, find) if self._fixed else find()
+
+    @property
+    def width(self) -> int:
+        """Number of all signals."""
+        return sum(signal.width for signal in self)
+
+    def series(self, moment: float, left: float, until: float, accuracy: float, rounding: Array) -> list[Series]:
+        """Series and bounds of the signals over a segment.
+
+        Parameters
+        ----------
+        moment : float
+            A time inside [s].
+        left, until : float
+            The segment [s], without a breakpoint inside.
+        accuracy : float
+            Maximum truncation error, relative to each signal.
+        rounding : ndarray, shape (nsignals,)
+            Rounding errors of the signals.
+        """
+        if not self._fixed:
+            return self._resolved(moment, left, until, accuracy, rounding)
+        key = left, until, accuracy, rounding.tobytes()
+        return self._series.get(key, lambda: self._resolved(moment, left, until, accuracy, rounding))
+
+    def _resolved(self, moment: float, left: float, until: float, accuracy: float, rounding: Array) -> list[Series]:
+        lines = [signal.ends(left, until) for signal in self]
+        known = [line for line in lines if line is not None]
+        if known and len(known) == len(lines):
+            return [straight(left, until, *(np.concatenate(values) for values in zip(*known, strict=True)))]
+        sums = {signal.harmonics for signal in self if isinstance(signal, PlanSignal)} - {None}
+        harmonics = sums.pop() if self._fixed and len(sums) == 1 else None
+        return [
+            series.bounded(*self._bounds(moment, series.left, series.right)).with_harmonics(
+                harmonics, accuracy, rounding
+            )
+            for series in resolved(partial(self._analytic_at, moment, left), left, until, accuracy, rounding)
+        ]
+
+    def _analytic_at(self, moment: float, origin: float, s: Array) -> Array:
+        return np.concatenate([np.zeros((0, s.size)), *(signal.analytic_at(moment, origin, s) for signal in self)])
+
+    def _bounds(self, moment: float, left: float, right: float) -> list[Array]:
+        found = [signal.bounds(moment, left, right) for signal in self]
+        return [np.concatenate([np.zeros(0), *(pair[side] for pair in found)]) for side in (0, 1)]
+
+
+def harmonic_terms(angle: Array, count: int) -> Array:
+    """Terms (2 count + 1, n) of `Harmonics` at angles (n,)."""
+    multiples = np.arange(1.0, count + 1.0)[:, None] * angle
+    pairs = np.stack([np.cos(multiples), np.sin(multiples)], axis=1).reshape(2 * count, -1)
+    return np.concatenate([np.ones((1, angle.size)), pairs])
 
 
 def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[TimeSignal]:
@@ -332,6 +451,17 @@ def straight(left: float, right: float, first: Array, last: Array) -> Series:
 def _unbounded(left: float, right: float, coefficients: Array) -> Series:
     free = np.full(len(coefficients), np.inf)
     return Series(left, right, coefficients, -free, free)
+
+
+def _unclipped(series: Series, times: Array) -> Array:
+    """Values (nsignals, ntime) of a series, not clipped to its bounds."""
+    u = (2.0 * times - series.left - series.right) / (series.right - series.left)
+    return np.asarray(np.polynomial.chebyshev.chebval(u, series.coefficients.T))
+
+
+def _read_only(values: Array) -> Array:
+    values.flags.writeable = False
+    return values
 
 
 def _ordered(ends: Array) -> tuple[Array, Array]:

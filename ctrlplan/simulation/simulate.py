@@ -254,9 +254,13 @@ def _response(job: Job, record: Record) -> SimulationResponse:
         times, states = np.append(times[times < last], last), np.column_stack([states[:, times < last], end])
         found = [occurrence for occurrence in found if occurrence.time <= last]
     seen = record.snapshot(times, states)
+
+    def outputs() -> Array:
+        return seen.y.reshape(len(prepared.output_labels), times.size)
+
     return SimulationResponse(
         times,
-        seen.y.reshape(len(prepared.output_labels), times.size),
+        outputs if record.is_pure else outputs(),
         states,
         seen.u,
         params=job.params or None,

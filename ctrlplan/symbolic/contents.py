@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import types
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import suppress
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +25,8 @@ class Slots:
     """Attributes of an object in slots of its classes."""
 
     def __init__(self, value: object) -> None:
-        self.value = value
-        self.places = {
-            name: member
-            for base in type(value).__mro__
-            for name, member in vars(base).items()
-            if isinstance(member, types.MemberDescriptorType) and written_in_python(base)
-        }
+        kind: Hashable = type(value)
+        self.value, self.places = value, _slots_of(kind)
 
     def values(self) -> dict[str, object]:
         """Values of the slots that are set, by name."""
@@ -41,6 +37,17 @@ class Slots:
             except AttributeError:
                 continue
         return found
+
+
+@lru_cache(maxsize=1024)
+def _slots_of(kind: type) -> dict[str, types.MemberDescriptorType]:
+    """Slots of the objects of a class, which are known once it is created."""
+    return {
+        name: member
+        for base in kind.__mro__
+        for name, member in vars(base).items()
+        if isinstance(member, types.MemberDescriptorType) and written_in_python(base)
+    }
 
 
 def contents_of(value: object) -> object:

@@ -17,7 +17,7 @@ import random
 import types
 from array import array
 from collections import defaultdict, deque, namedtuple
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
 from typing import Any
 
@@ -153,13 +153,9 @@ class References:
         self._tokens += ("object", number)
 
     def _visit(self, value: object, where: str) -> None:
-        kind = type(value)
+        kind: Hashable = type(value)
         self._tokens.append(Same(kind))
-        for kinds, visit in _VISITS:
-            if isinstance(value, kinds):
-                visit(self, value, where)
-                return
-        self._instance(value, where)
+        _visit_of(kind)(self, value, where)
 
     def _add_named(self) -> None:
         """Add attributes with names that occur in the code found so far."""
@@ -450,6 +446,12 @@ _VISITS: tuple[tuple[type | tuple[type, ...], Callable[[References, Any, str], N
     ((Iterator, types.CoroutineType, functools._lru_cache_wrapper), References._nothing),
 )
 """Methods by type of object; the first match applies."""
+
+
+@functools.lru_cache(maxsize=1024)
+def _visit_of(kind: type) -> Callable[[References, Any, str], None]:
+    """Method for the objects of a type."""
+    return next((visit for kinds, visit in _VISITS if issubclass(kind, kinds)), References._instance)
 
 
 def _unbound(value: object) -> object:

@@ -16,7 +16,6 @@ from ctrlplan.simulation.job import Job, Record, fresh_job
 from ctrlplan.simulation.numerical import VISITED, Attempt, equations_of, numerical
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.segments import NetworkRun
-from ctrlplan.simulation.signals import signal_values
 from ctrlplan.symbolic import missing_casadi
 from ctrlplan.symbolic.comparison import telling_states
 
@@ -67,7 +66,7 @@ class CompiledMethod:
 
         known = equations_of(job, attempt.copies) if form.has_loops else None
         if known is not None:  # an algebraic loop without a solution gives a clearer error here
-            known.signals(job.first, job.state, signal_values(attempt.time_signals, job.times[:1])[:, 0])
+            known.signals(job.first, job.state, attempt.time_signals.at(job.times[:1])[:, 0])
         max_steps = _STEPS_WITH_STOPS if attempt.stops else _STEPS
         return CompiledSolver(form, job.params, attempt.tolerances, attempt.scales, max_steps=max_steps)
 
@@ -87,12 +86,12 @@ def _disagreement(attempt: Attempt[CompiledSolver], solver: CompiledSolver) -> s
     """Disagreement of a compiled form with Python at states of a run; empty if none, or if no comparison is due."""
     job, run, form = attempt.job, attempt.run, solver.form
     p = form.parameters(job.params)
-    values = attempt.time_values(run.times)
+    values = attempt.time_values(run.times) if form.nswitches else np.empty((0, run.times.size))
     if not form.compared.is_due(form.sides(run.times, run.states, values, p)):
         return ""
     count = max(1, solver.evaluations // _SHARE) if solver.evaluations else VISITED
     t, x = _closer(run, solver)
-    values = signal_values(attempt.time_signals, t)
+    values = attempt.time_signals.at(t)
     w, sides = form.signals(t, x, values, p), form.sides(t, x, values, p)
     places = telling_states(sides, np.concatenate([w, x]), count)
     # Each block is compared at the inputs that the form computes: if all agree, so does the whole.
