@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.metrics._error import squared
-from ctrlplan.metrics._pieces import maxima, pieces
+from ctrlplan.metrics._pieces import peaks, pieces
 from ctrlplan.metrics._records import QUIET, Array, Value, diverged, each, fitted, plain, real, times
 from ctrlplan.metrics._records import signal as checked
 
@@ -83,7 +83,7 @@ def peak(timepts: ArrayLike, signal: ArrayLike) -> Value:
     record = checked(signal, "signal", t)
     rows = record.reshape(-1, t.size)
     with np.errstate(**QUIET):
-        return plain(np.maximum(maxima(t, rows), maxima(t, -rows)), record.shape[:-1])
+        return plain(peaks(t, rows), record.shape[:-1])
 
 
 def total_variation(timepts: ArrayLike, signal: ArrayLike) -> Value:

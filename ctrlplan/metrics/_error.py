@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.metrics._pieces import NOWHERE, Pieces, blocks, joined, pieces
+from ctrlplan.metrics._pieces import NOWHERE, Pieces, joined, pieces, squares
 from ctrlplan.metrics._records import QUIET, Array, Value, diverged, instant, plain, signal, times
 
 
@@ -128,11 +128,9 @@ def ise(timepts: ArrayLike, error: ArrayLike) -> Value:
 def squared(t: Array, f: Array) -> Value:
     """Return the integrals of f^2, shape (...)."""
     rows = f.reshape(-1, t.size)
-    values = np.empty(len(rows))
     with np.errstate(**QUIET):
-        for some in blocks(rows):
-            values[some] = pieces(t, rows[some][0] if len(rows[some]) == 1 else rows[some]).square()
-            values[some][[diverged(row) for row in rows[some]]] = np.inf
+        values = squares(t, rows)
+        values[[diverged(row) for row in rows]] = np.inf
     return plain(values, f.shape[:-1])
 
 

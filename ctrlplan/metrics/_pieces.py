@@ -16,7 +16,7 @@ there, with dynamics that samples as far apart as its time constants do not show
 from the extrapolated curvature alone, is therefore no overshoot of a response.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -26,6 +26,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._lru import Lru
 from ctrlplan.metrics._records import Array
 
 G = TypeVar("G", bound=np.generic)
@@ -34,6 +35,7 @@ _NEIGHBOURS = 4.0  # multiple of a neighbouring third difference above which the
 _CURVATURES = 0.5  # difference relative to the smaller curvature up to which two curvatures are smooth
 _ASIDE = 0.25  # of the larger curvature: a smaller one of opposite sign is the smooth side of a kink
 _JUMP = 2.0  # multiple of both neighbouring slopes above which there is a jump
+_UNEVEN = 4.0  # ratio of adjacent intervals up to which few digits are lost in products of samples
 _BLOCK = 2**15  # samples
 _LONG = 2**9  # samples, from which on one row costs more than the calls for it
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -42,7 +44,7 @@ _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 NOWHERE = np.empty(0, dtype=np.intp)
 
-_known: ContextVar["dict[tuple[bytes, bytes, tuple[int, ...]], Pieces] | None"] = ContextVar("_known", default=None)
+_known: ContextVar["dict[Hashable, list[tuple[Array, Array, Pieces]]] | None"] = ContextVar("_known", default=None)
 
 
 @dataclass(frozen=True)
@@ -155,14 +157,16 @@ class Pieces:
         return s
 
     def square(self) -> Array:
-        """Return the integrals over time of the squares (...), from Legendre series of the cubics."""
-        bend = (self.c + 1.5 * self.d) / 6
-        mean = (self.a + self.end) / 2 - bend
-        tilt = self.end - self.a - self.d / 10
-        squares = mean * mean + tilt * tilt / 12 + bend * bend / 5 + self.d * self.d / 2800
+        """Return the integrals over time of the squares (...)."""
+        return np.sum(self.squares, axis=-1)
+
+    @property
+    def squares(self) -> Array:
+        """Return the same for each interval, (..., m)."""
+        squares = _mean_square(self.a, self.end, self.c, self.d)
         if self.jump.any():
             squares = np.where(self.jump, (self.a**2 + self.end**2) / 2, squares)
-        return np.sum(self.step * squares, axis=-1)
+        return self.step * squares
 
     def integral(self, cuts: Array, integrand: Callable[[Array], Array]) -> float:
         """Return the integral over time of a function of s, between successive cuts, shape (ncuts, m)."""
@@ -175,6 +179,17 @@ class Pieces:
         for node, weight in zip(_NODES, _WEIGHTS, strict=True):
             total += weight * integrand(cuts[:-1] + node * width)
         return np.sum(self.step * width * total, axis=0)
+
+
+def _legendre(a: Array, end: Array, c: Array, d: Array) -> list[tuple[float, Array]]:
+    """Return the coefficients of Legendre series of cubics with the given ends, and the mean squares of their terms."""
+    bend = (c + 1.5 * d) / 6
+    return [(1.0, (a + end) / 2 - bend), (1 / 12, end - a - d / 10), (1 / 5, bend), (1 / 2800, d)]
+
+
+def _mean_square(a: Array, end: Array, c: Array, d: Array) -> Array:
+    """Return the mean squares of cubics a + b s + c s^2 + d s^3 with the given ends."""
+    return np.asarray(sum(weight * term * term for weight, term in _legendre(a, end, c, d)))
 
 
 def joined(parts: Sequence[Pieces]) -> Pieces:
@@ -211,17 +226,43 @@ class Bulges:
 
     def __init__(self, t: Array) -> None:
         step = np.diff(t)
-        self.pace, self.width, self.share = 1.0 / step, 1.0 / (t[2:] - t[:-2]), step[1:-1] ** 2 / 4
+        self._pace, self._width, self._share = 1.0 / step, 1.0 / (t[2:] - t[:-2]), step[1:-1] ** 2 / 4
+        # Of four samples of magnitude 1: both curvatures are at most 2 / (product of the adjacent steps).
+        self._largest = 1.0 + 1e-9 + float((step[1:-1] / (2 * np.minimum(step[:-2], step[2:]))).max(initial=0.0))
 
-    def __call__(self, f: Array, first: int = 0) -> Array:
-        """Return the bounds of a signal from sample `first` on, one per interval without the outer two."""
-        slope = (f[first + 1 :] - f[first:-1]) * self.pace[first:]
-        d = slope[1:] - slope[:-1]
-        d *= self.width[first:]
+    def beyond(self, f: Array, size: Array, level: float, first: int = 0) -> NDArray[np.intp]:
+        """Return the intervals in which the cubic of a signal, or its magnitude, may exceed a level.
+
+        Parameters
+        ----------
+        f, size : ndarray, shape (ntime,)
+            The signal, and the signal or its magnitude, which is compared with the level.
+        level : float
+            The level.
+        first : int, default 0
+            First interval. It and the last one, with no bound, are included.
+        """
+        last, inner = f.size - 2, NOWHERE
+        large = ~(np.abs(f[first:]) * self._largest <= level)  # otherwise far below the level, also between samples
+        if large.any():
+            begin = max(first + int(large.argmax()) - 3, first)
+            end = min(f.size - int(large[::-1].argmax()) + 3, f.size)
+            inner = begin + 1 + self._inner(f[begin:end], size[begin:end], level, begin)
+        return np.concatenate([[first], inner, [last][: last - first]]).astype(np.intp)
+
+    def _inner(self, f: Array, size: Array, level: float, begin: int) -> NDArray[np.intp]:
+        """Return these intervals of the samples from `begin` on, counted from the second interval."""
+        if f.size < 4:
+            return NOWHERE
+        slope = np.diff(f)
+        slope *= self._pace[begin : begin + slope.size]
+        d = np.diff(slope)
+        d *= self._width[begin : begin + d.size]
         np.abs(d, out=d)
-        slope[0] = slope[-1] = np.inf
-        np.multiply(np.maximum(d[:-1], d[1:]), self.share[first:], out=slope[1:-1])
-        return slope
+        reach = np.maximum(d[:-1], d[1:])
+        reach *= self._share[begin : begin + reach.size]
+        reach += np.maximum(size[1:-2], size[2:-1])
+        return np.flatnonzero(~(reach <= level))  # nan is included, as it cannot be excluded
 
 
 def blocks(f: Array) -> Iterator[slice]:
@@ -237,16 +278,115 @@ def maximum(t: Array, f: Array) -> float:
 
 def maxima(t: Array, f: Array, extrapolated: bool = True) -> Array:
     """Return the maximum of each of several signals (nrows, ntime), of all intervals or without those that begin."""
-    top, bulges = f.max(axis=1), Bulges(t)
-    near = [  # nan is included, as it cannot be excluded
-        np.flatnonzero(~(np.maximum(row[:-1], row[1:]) + bulges(row) <= peak)) if np.isfinite(peak) else NOWHERE
-        for row, peak in zip(f, top, strict=True)
-    ]
+    return _largest(t, f, lambda values: values, extrapolated)
+
+
+def peaks(t: Array, f: Array) -> Array:
+    """Return the peak magnitude of each of several signals (nrows, ntime)."""
+    return _largest(t, f, np.abs, True)
+
+
+def _largest(t: Array, f: Array, size: Callable[[Array], Array], extrapolated: bool) -> Array:
+    """Return the maximum of the signals or of their magnitudes."""
+    bulges, top, near = Bulges(t), np.empty(len(f)), []
+    for i, row in enumerate(f):
+        sized = size(row)
+        top[i] = sized.max()
+        near.append(bulges.beyond(row, sized, float(top[i])) if np.isfinite(top[i]) else NOWHERE)
     chosen, rows = gathered(near)
     p = pieces(t, f, chosen, rows)
-    inner = np.fmax.reduce(p(p.cuts), axis=0)
+    inner = np.fmax.reduce(size(p(p.cuts)), axis=0)
     np.fmax.at(top, rows, inner if extrapolated else np.where(p.begins, -np.inf, inner))
     return top
+
+
+def squares(t: Array, f: Array) -> Array:
+    """Return the integrals over time of the squares of several signals (nrows, ntime)."""
+    if f.shape[1] < _LONG or not _is_even(t):
+        return np.concatenate([_cubics(t, f[some]).square() for some in blocks(f)] or [np.empty(0)])
+    found = _FORMS.get(t.tobytes(), lambda: _SquareForm(t))(f)
+    for i in np.flatnonzero(~np.isfinite(found)):  # terms may overflow where the squares of the signal do not
+        found[i] = _cubics(t, f[i]).square()
+    return found
+
+
+def _is_even(t: Array) -> bool:
+    """Return whether adjacent intervals differ little, so that the terms of the quadratic form do not cancel."""
+    step = np.diff(t)
+    return bool(np.all(np.maximum(step[1:], step[:-1]) <= _UNEVEN * np.minimum(step[1:], step[:-1])))
+
+
+class _SquareForm:
+    """Integral of the square of a signal as a quadratic form of its samples.
+
+    Where the curvature is smooth, a cubic is linear in its four samples: the form has four bands. Other intervals are
+    corrected.
+    """
+
+    def __init__(self, t: Array) -> None:
+        self._t, self._step, self._width, self._span = t, np.diff(t), t[2:] - t[:-2], t[3:] - t[:-3]
+        early, step, late = self._step[:-2], self._step[1:-1], self._step[2:]
+        none, one = np.zeros_like(step), np.ones_like(step)
+        # Factors of the samples k - 1 to k + 2, shape (4, m), for the interval from k to k + 1.
+        left = np.array([1 / early, -1 / early - 1 / step, 1 / step, none]) / self._width[:-1]
+        right = np.array([none, 1 / step, -1 / step - 1 / late, 1 / late]) / self._width[1:]
+        third = (right - left) / self._span
+        ends = np.array([none, one, none, none]), np.array([none, none, one, none])
+        terms = _legendre(*ends, *_bent(left, third, early, step))
+        self._bands = [np.zeros(t.size - j) for j in range(4)]
+        for i in range(4):
+            for j in range(4 - i):
+                products = sum(weight * term[i] * term[i + j] for weight, term in terms)
+                self._bands[j][i : i + step.size] += (1 if j == 0 else 2) * step * products
+
+    def __call__(self, f: Array) -> Array:
+        """Return the integrals of signals (nrows, ntime), shape (nrows,)."""
+        found, rough, near = np.empty(len(f)), list[NDArray[np.intp]](), list[tuple[Array, ...]]()
+        for i, row in enumerate(f):
+            found[i] = sum(band @ (row[: band.size] * row[row.size - band.size :]) for band in self._bands)
+            slope = np.diff(row)
+            slope /= self._step
+            d = np.diff(slope)
+            d /= self._width
+            change, size = np.diff(d), np.abs(d)
+            k = np.flatnonzero(~(np.abs(change) <= _CURVATURES * np.minimum(size[:-1], size[1:])))
+            change /= self._span
+            steep = np.abs(slope[k + 1]) > _JUMP * np.maximum(np.abs(slope[k]), np.abs(slope[k + 2]))
+            near.append((change[k], *_neighbours(change, (k,)), d[k], d[k + 1], row[k + 1], row[k + 2], steep))
+            rough.append(k)
+        every, rows = gathered(rough)
+        np.add.at(found, rows, self._corrections(every, *map(np.concatenate, zip(*near, strict=True))))
+        ends = np.tile([0, f.shape[1] - 2], len(f))
+        np.add.at(found, np.repeat(np.arange(len(f)), 2), pieces(self._t, f, ends, np.arange(len(f)).repeat(2)).squares)
+        return found
+
+    def _corrections(
+        self,
+        k: NDArray[np.intp],
+        c: Array,
+        before: Array,
+        after: Array,
+        one: Array,
+        other: Array,
+        a: Array,
+        end: Array,
+        steep: Array,
+    ) -> Array:
+        """Return what the cubics of inner intervals k + 1 without smooth curvature add to the form."""
+        base, cut, broken, _ = _sided(c, before, after, one, other, self._span[k])
+        early, step = self._step[k], self._step[k + 1]
+        squares = _mean_square(a, end, *_bent(base, cut, early, step))
+        squares = np.where(broken & (steep > 0), (a**2 + end**2) / 2, squares)
+        return step * (squares - _mean_square(a, end, *_bent(one, c, early, step)))
+
+
+_FORMS: Lru[bytes, _SquareForm] = Lru(4)
+
+
+def _bent(base: Array, third: Array, early: Array, step: Array) -> tuple[Array, Array]:
+    """Return c and d of cubics from their brackets at the start of the interval before, as in `_shapes`."""
+    d = third * step**3
+    return (base + early * third) * step**2 - d, d
 
 
 def gathered(chosen: list[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -260,10 +400,13 @@ def _once(t: Array, f: Array) -> Pieces:
     if known is None:
         return _cubics(t, f)
     # Signals are known by their values, as a measure may use an array for one signal after the other.
-    name = t.tobytes(), f.tobytes(), f.shape
-    if name not in known:
-        known[name] = _cubics(np.frombuffer(name[0]), np.frombuffer(name[1]).reshape(f.shape))
-    return known[name]
+    same = known.setdefault((f.shape, *f.flat[[0, f.size // 2, -1]].tolist()), [])
+    for times, signal, found in same:
+        if np.array_equal(signal, f) and np.array_equal(times, t):
+            return found
+    times, signal = t.copy(), f.copy()
+    same.append((times, signal, _cubics(times, signal)))
+    return same[-1][2]
 
 
 def _cubics(t: Array, f: Array) -> Pieces:
@@ -296,20 +439,11 @@ def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_], NDArra
     third = _finite(change / span)
     steady = np.abs(change) <= _CURVATURES * np.minimum(size[..., :-1], size[..., 1:])
 
-    # Where the curvature is smooth, all four samples are used; elsewhere their third difference is limited to a
-    # multiple of its neighbours, with the smoother side.
-    base, twist, broken = left.copy(), third.copy(), np.zeros_like(steady)
+    # Where the curvature is smooth, all four samples are used.
+    base, twist, broken, begins = left.copy(), third.copy(), np.zeros_like(steady), np.zeros_like(steady)
     at = np.nonzero(~steady)
-    c, one, other = third[at], left[at], right[at]
-    cut = _cut(c, *_neighbours(third, at))
-    nearer = np.where(np.abs(one) <= np.abs(other), one, other - np.broadcast_to(span, third.shape)[at] * cut)
-    lesser, greater = np.minimum(np.abs(one), np.abs(other)), np.maximum(np.abs(one), np.abs(other))
-    across = (np.sign(one) * np.sign(other) <= 0) & (lesser > _ASIDE * greater)
-    share = np.divide(cut, c, out=np.ones_like(c), where=c != 0)
-    base[at], twist[at] = np.where(across, share * one, nearer), cut
-    broken[at] = np.abs(c - cut) > np.abs(c) / 2
-    begins = np.zeros_like(steady)
-    begins[at] = ~across & (np.abs(one) > np.abs(other))
+    wide = np.broadcast_to(span, third.shape)[at]
+    base[at], twist[at], broken[at], begins[at] = _sided(third[at], *_neighbours(third, at), left[at], right[at], wide)
     bow = base + (t[..., 1:-2] - t[..., :-3]) * twist
 
     # An outer interval has the four samples of its neighbour and one side only: its curvature is reduced by what was
@@ -333,6 +467,21 @@ def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_], NDArra
         _between(jump, broken, drop),
         _between(first_begins, begins, ~first_begins),
     )
+
+
+def _sided(
+    c: Array, before: Array, after: Array, one: Array, other: Array, span: Array
+) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the same for intervals without smooth curvature, from the third differences and both curvatures.
+
+    The third difference is limited to a multiple of its neighbours, with the curvature of the smoother side.
+    """
+    cut = _cut(c, before, after)
+    size, far = np.abs(one), np.abs(other)
+    nearer = np.where(size <= far, one, other - span * cut)
+    across = (np.sign(one) * np.sign(other) <= 0) & (np.minimum(size, far) > _ASIDE * np.maximum(size, far))
+    share = np.divide(cut, c, out=np.ones_like(c), where=c != 0)
+    return np.where(across, share * one, nearer), cut, np.abs(c - cut) > np.abs(c) / 2, ~across & (size > far)
 
 
 def _neighbours(third: Array, at: tuple[NDArray[np.intp], ...]) -> tuple[Array, Array]:

@@ -248,8 +248,7 @@ def _last_entries(t: Array, e: Array, edges: Array) -> Array:
             continue
         outside = np.flatnonzero(size > edge)
         first = int(outside[-1]) if outside.size else 0
-        reach = np.maximum(size[first:-1], size[first + 1 :]) + bulges(f, first)
-        near.append(np.flatnonzero(~(reach <= edge)) + first)
+        near.append(bulges.beyond(f, size, float(edge), first))
     chosen, rows = gathered(near)
     p = pieces(t, e, chosen, rows)
     cuts, values = p.cuts, p.values

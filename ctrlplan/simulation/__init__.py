@@ -70,7 +70,7 @@ from ctrlplan.simulation.log import measured_response, read_log
 from ctrlplan.simulation.loop_quantities import LoopQuantities, loop_quantities
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.predictor import Predictor
-from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start
+from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start, unchanged
 from ctrlplan.simulation.response import SimulationResponse, signal_table
 from ctrlplan.simulation.sampled_response import SampledQuantities
 from ctrlplan.simulation.simulate import simulate
@@ -103,6 +103,7 @@ __all__ = [
     "simulate",
     "state_space",
     "stated_start",
+    "unchanged",
     "unstable_poles",
     "what_happened",
 ]

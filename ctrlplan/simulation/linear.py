@@ -71,11 +71,26 @@ class LinearForm:
             return bool(growing), bool(fast), False
         scale = state_scale(self.a)
         a = duration * self.a * (scale / scale[:, None])
-        rounding = np.finfo(float).eps * np.abs(a).sum(axis=0).max()
+        rounding = _rounding(a)
         # norm(exp(a)) <= exp(largest eigenvalue of the symmetric part), which is usually sufficient.
         bound = np.exp(np.clip(np.linalg.eigvalsh(a + a.T).max(), 0.0, 700.0))
         nonnormal = rounding * bound > _UNCERTAIN and rounding * largest_change(a, 1.0) ** 2 > _UNCERTAIN
         return False, False, bool(nonnormal)
+
+    def is_sensitive(self, duration: float) -> NDArray[np.bool_]:
+        """Whether any of these amplifies rounding errors in each of several loops, shape (nloops,)."""
+        if not self.a.size:
+            return np.zeros(len(self.a), dtype=bool)
+        scale = state_scale(np.abs(self.a).max(axis=0))
+        a = duration * self.a * (scale / scale[:, None])
+        poles, vectors = np.linalg.eig(a)
+        found = np.asarray((poles.real.max(axis=1) > _GROWING) | (np.abs(poles).max(axis=1) > _FAST))
+        with np.errstate(all="ignore"):  # a defective matrix has no bound
+            bound = np.exp(np.maximum(poles.real.max(axis=1), 0.0)) * np.linalg.cond(vectors)
+            uncertain = ~(_rounding(a) * (1.0 + bound) ** 2 <= _UNCERTAIN)
+        for i in np.flatnonzero(~found & uncertain):
+            found[i] = any(LinearForm(self.a[i], self.b[i], self.c[i], self.d[i], self.sources).sensitivity(duration))
+        return found
 
     def rounding(self, states: Array, inputs: Array) -> Array:
         """Rounding errors of the outputs for states and inputs of given size, shape (noutputs,)."""
@@ -83,6 +98,11 @@ class LinearForm:
         largest = np.abs(states / scale[:, None]).max(initial=0.0)
         fed = np.abs(self.c) @ scale * largest + np.abs(self.d) @ np.abs(inputs).max(axis=1, initial=0.0)
         return np.asarray(64.0 * np.finfo(float).eps * fed)
+
+
+def _rounding(a: Array) -> Array:
+    """Relative rounding errors of matrices (..., n, n)."""
+    return np.asarray(np.finfo(float).eps * np.abs(a).sum(axis=-2).max(axis=-1))
 
 
 def linear_form(system: System) -> LinearForm:
@@ -120,27 +140,96 @@ def linear_forms(systems: Sequence[System], discrete: bool = False) -> LinearFor
         If an algebraic loop has no unique solution, or the systems differ in more
         than numerical values.
     """
-    kinds = {_kind(system, discrete) for system in systems}
-    if len(kinds) > 1:
-        raise _unlike(systems)
-    kind = kinds.pop()
+    return stacked_form([linear_parts(system, discrete) for system in systems])
+
+
+@dataclass(frozen=True, eq=False)
+class LinearParts:
+    """Numbers of a linear system, copied.
+
+    Attributes
+    ----------
+    name : str
+        Name of the system.
+    ninputs : int
+        Number of inputs.
+    matrices : tuple of ndarray
+        A, B, C and D; of an interconnection, its maps of connections, inputs and outputs.
+    blocks : tuple of LinearParts or None
+        Blocks of an interconnection.
+    source : (Trajectory, int) or None
+        Plan and highest derivative of a source, which has no matrices.
+    width : int
+        Number of outputs of a source.
+    """
+
+    name: str
+    ninputs: int
+    matrices: tuple[Array, ...]
+    blocks: tuple[LinearParts, ...] | None = None
+    source: tuple[Trajectory, int] | None = None
+    width: int = 0
+
+    @property
+    def has_sources(self) -> bool:
+        """Whether there are sources in the system."""
+        return self.source is not None or any(block.has_sources for block in self.blocks or ())
+
+    def fits(self, other: LinearParts) -> bool:
+        """Whether two systems differ only in the numerical values of their blocks."""
+        kinds = [(one.source, len(one.matrices), len(one.blocks or ()), one.blocks is None) for one in (self, other)]
+        if kinds[0] != kinds[1]:
+            return False
+        pairs = zip(self.matrices, other.matrices, strict=True)
+        if self.blocks is None:
+            return all(one.shape == two.shape for one, two in pairs)
+        blocks = zip(self.blocks, other.blocks or (), strict=True)
+        return all(np.array_equal(one, two) for one, two in pairs) and all(one.fits(two) for one, two in blocks)
+
+    def equals(self, other: LinearParts) -> bool:
+        """Whether two systems have the same numbers."""
+        pairs = zip(self.matrices, other.matrices, strict=True)
+        blocks = zip(self.blocks or (), other.blocks or (), strict=True)
+        return (
+            self.fits(other)
+            and all(np.array_equal(one, two) for one, two in pairs)
+            and all(one.equals(two) for one, two in blocks)
+        )
+
+
+def linear_parts(system: System, discrete: bool = False) -> LinearParts:
+    """Numbers of a linear system; arguments and errors as for `linear_forms`."""
+    kind, name, count = _kind(system, discrete), str(system.name), system.ninputs or 0
     if kind is ct.InterconnectedSystem:
-        return _interconnections(systems, discrete)
-    if kind is ct.TransferFunction:
-        return linear_forms([ct.ss(system) for system in systems], discrete)
-    if kind is ct.StateSpace:
-        matrices = [[_matrix(system, name) for system in systems] for name in "ABCD"]
-        if any(matrix.shape != row[0].shape for row in matrices for matrix in row):
-            raise _unlike(systems)
-        a, b, c, d = map(np.stack, matrices)
+        blocks = tuple(linear_parts(block, discrete) for block in system.syslist)
+        maps = tuple(np.array(getattr(system, f"{one}_map"), dtype=float) for one in ("connect", "input", "output"))
+        return LinearParts(name, count, maps, blocks)
+    traits = traits_of(system)
+    if kind is Trajectory and traits.plan is not None:
+        return LinearParts(name, 0, (), None, (traits.plan, traits.derivatives), system.noutputs or 0)
+    system = ct.ss(system) if kind is ct.TransferFunction else system
+    return LinearParts(name, count, tuple(_matrix(system, one).copy() for one in "ABCD"))
+
+
+def stacked_form(systems: Sequence[LinearParts]) -> LinearForm:
+    """Linear forms of systems that fit each other, stacked; errors as for `linear_forms`."""
+    first = systems[0]
+    if not all(first.fits(system) for system in systems[1:]):
+        raise ValueError(
+            f"systems must differ only in numerical values, got other blocks or connections in one named {first.name}"
+        )
+    if first.source is not None:
+        count, n = len(systems), first.width
+        a, b, c = map(np.zeros, ((count, 0, 0), (count, 0, n), (count, n, 0)))
+        return LinearForm(a, b, c, np.tile(np.eye(n), (count, 1, 1)), (first.source,))
+    if first.blocks is None:
+        a, b, c, d = (np.stack([system.matrices[k] for system in systems]) for k in range(4))
         return LinearForm(a, b, c, d, ())
-    sources = [traits_of(system) for system in systems]
-    plan, high = sources[0].plan, sources[0].derivatives
-    if plan is None or any(source.plan is not plan or source.derivatives != high for source in sources):
-        raise _unlike(systems)
-    count, n = len(systems), systems[0].noutputs
-    a, b, c = map(np.zeros, ((count, 0, 0), (count, 0, n), (count, n, 0)))
-    return LinearForm(a, b, c, np.tile(np.eye(n), (count, 1, 1)), ((plan, high),))
+    forms = [stacked_form(blocks) for blocks in zip(*(system.blocks or () for system in systems), strict=True)]
+    counts = [block.ninputs for block in first.blocks]
+    names = [block.name for block in first.blocks]
+    connect, external, outputs = first.matrices
+    return closed(forms, counts, names, connect, external.reshape(sum(counts), -1), outputs, first.name)
 
 
 def in_right_half(poles: NDArray[np.inexact]) -> NDArray[np.bool_]:
@@ -164,26 +253,6 @@ def _kind(system: System, discrete: bool) -> type:
     if isinstance(traits_of(system).plan, Trajectory):
         return Trajectory
     raise NotLinearError(f"block {system.name} ({type(system).__name__}) is not linear")
-
-
-def _unlike(systems: Sequence[System]) -> ValueError:
-    return ValueError(
-        f"systems must differ only in numerical values, got other blocks or connections in one named {systems[0].name}"
-    )
-
-
-def _interconnections(systems: Sequence[System], discrete: bool) -> LinearForm:
-    first = systems[0]
-    maps = ("connect_map", "input_map", "output_map")
-    connect, external, outputs = (np.asarray(getattr(first, name), dtype=float) for name in maps)
-    for system in systems[1:]:
-        same = all(np.array_equal(getattr(system, name), getattr(first, name)) for name in maps)
-        if len(system.syslist) != len(first.syslist) or not same:
-            raise _unlike(systems)
-    forms = [linear_forms(blocks, discrete) for blocks in zip(*(system.syslist for system in systems), strict=True)]
-    counts = [block.ninputs or 0 for block in first.syslist]
-    names = [str(block.name) for block in first.syslist]
-    return closed(forms, counts, names, connect, external.reshape(sum(counts), -1), outputs, first.name)
 
 
 def closed(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -415,7 +417,7 @@ def prepared_form(system: System | Prepared) -> Prepared:
 
     Changes are those of connections, parameters and blocks.
     """
-    if isinstance(system, Prepared) and system.original is None:
+    if isinstance(system, Prepared) and (system.original is None or system is _UNCHANGED.get()):
         return system
     with BUILDING:  # no other thread makes trial calls of a block
         if isinstance(system, Prepared):
@@ -424,6 +426,17 @@ def prepared_form(system: System | Prepared) -> Prepared:
             system = system.original
         _checked_system(system)
         return _FORMS.get(fingerprint(system), partial(Prepared, system))
+
+
+@contextmanager
+def unchanged(system: System | Prepared) -> Iterator[Prepared]:
+    """Prepared form of a system that does not change in the block, in which it is compared with the system once."""
+    prepared = prepared_form(system)
+    token = _UNCHANGED.set(prepared)
+    try:
+        yield prepared
+    finally:
+        _UNCHANGED.reset(token)
 
 
 def stated_start(system: System | Prepared) -> Array | None:
@@ -478,3 +491,6 @@ def _checked_system(system: System) -> System:
 
 
 _FORMS: Lru[tuple[object, ...], Prepared] = Lru(_CACHE_SIZE)
+
+_UNCHANGED: ContextVar[Prepared | None] = ContextVar("_UNCHANGED", default=None)
+"""Form that need not be compared with its system."""

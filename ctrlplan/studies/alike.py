@@ -13,47 +13,45 @@ from ctrlplan._types import Array
 from ctrlplan.simulation import state_space, stated_start
 from ctrlplan.simulation.equilibrium import equilibrium_of
 from ctrlplan.simulation.exact import exact_states
-from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_form
+from ctrlplan.simulation.linear import LinearForm, LinearParts, in_right_half, linear_parts, stacked_form
 from ctrlplan.studies.running import System, acting_outputs, tracked_outputs
 from ctrlplan.trajectories import Trajectory
 
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Matrices of a linear loop, copied: a builder may modify the loop for the next value.
+    """Numbers of a linear loop, copied: a builder may modify the loop for the next value.
 
     Attributes
     ----------
     labels, tracked, acting : tuple of str
         Its outputs; those that follow the plan; those that are controls.
-    form : LinearForm
-        Its matrices.
-    starts : dict of str to ndarray, shape (nstates,)
-        States at the first sample, by plan.
+    parts : LinearParts
+        Its blocks.
     """
 
     labels: tuple[str, ...]
     tracked: tuple[str, ...]
     acting: tuple[str, ...]
-    form: LinearForm
-    starts: dict[str, Array]
+    parts: LinearParts
 
     def fits(self, other: Linear) -> bool:
         """Whether two loops have the same structure."""
-        same = (getattr(self.form, name).shape == getattr(other.form, name).shape for name in "abcd")
-        return self.labels == other.labels and all(same)
+        return self.labels == other.labels and self.parts.fits(other.parts)
+
+    def is_of(self, loop: System) -> bool:
+        """Whether a loop has these labels and numbers."""
+        try:
+            system = state_space(loop)
+            return tuple(system.output_labels) == self.labels and self.parts.equals(linear_parts(system))
+        except (AttributeError, TypeError, ValueError):
+            return False
 
 
 def numbers_of(
-    loop: System,
-    first: Trajectory,
-    held: Mapping[str, Array],
-    duration: float,
-    outputs: Sequence[str] | None = None,
-    controls: Sequence[str] | None = None,
-    initial_state: ArrayLike | None = None,
+    loop: System, first: Trajectory, outputs: Sequence[str] | None = None, controls: Sequence[str] | None = None
 ) -> Linear | None:
-    """Matrices of a linear loop; None if it must be run separately.
+    """Numbers of a linear loop; None if it must be run separately.
 
     Parameters
     ----------
@@ -61,72 +59,106 @@ def numbers_of(
         As `compare` takes it.
     first : Trajectory
         The first of the plans.
-    held : mapping of str to ndarray, shape (naxes,)
-        First position of each plan.
-    duration : float
-        Length of the run [s].
-    outputs, controls, initial_state
+    outputs, controls
         As for `compare`.
     """
     try:
         system = state_space(loop)
-        form, stated = linear_form(system), stated_start(system)
-        if form.sources or stated is not None or form.b.shape[1] != first.naxes:
+        parts = linear_parts(system)
+        if parts.has_sources or stated_start(system) is not None or parts.ninputs != first.naxes:
             return None
         tracked = tracked_outputs(system, outputs, first)
         acting = acting_outputs(system, controls)
-        if initial_state is not None:
-            state = np.broadcast_to(real_array(initial_state, "initial_state"), (system.nstates,))
-            starts = dict.fromkeys(held, state)
-        else:
-            starts = {name: equilibrium_of(form, position) for name, position in held.items()}
     except (AttributeError, TypeError, ValueError):  # reported when the loop is run separately
         return None
-    if initial_state is None and not _at_rest(form, starts, held):
-        return None  # reported when the loop is run separately
-    if any(form.sensitivity(duration)):
-        return None  # `simulate` warns about the loss of digits
-    return Linear(tuple(system.output_labels), tracked, acting, form, starts)
+    return Linear(tuple(system.output_labels), tracked, acting, parts)
 
 
-def _at_rest(form: LinearForm, starts: Mapping[str, Array], held: Mapping[str, Array]) -> bool:
-    """Whether states are equilibria with the plans held at their first positions."""
-    for name, position in held.items():
-        moved = form.a @ starts[name] + form.b @ position
-        terms = np.abs(form.a) @ np.abs(starts[name]) + np.abs(form.b) @ np.abs(position)
-        if np.any(np.abs(moved) > 1e-6 * terms.max(initial=0.0)):
-            return False
-    return True
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Loops of the same structure, solved together.
 
-
-def outputs_together(
-    loops: Sequence[Linear], names: Sequence[str], plans: Mapping[str, Trajectory], times: Array
-) -> tuple[dict[str, Array], NDArray[np.bool_]]:
-    """Outputs of loops of the same structure, and whether each is unstable.
-
-    Parameters
+    Attributes
     ----------
-    loops : sequence of Linear
-        The loops.
-    names : sequence of str
-        Outputs wanted.
-    plans : mapping of str to Trajectory
-        The plans at their inputs.
-    times : ndarray, shape (ntime,)
-        Sample times [s].
-
-    Returns
-    -------
-    dict of str to ndarray, shape (nloops, nnames, ntime)
-        By plan.
-    ndarray of bool, shape (nloops,)
+    labels : tuple of str
+        Outputs of the loops.
+    form : LinearForm
+        Matrices of the loops, stacked.
+    starts : dict of str to ndarray, shape (nloops, nstates)
+        States at the first sample, by plan.
     """
-    rows = [loops[0].labels.index(name) for name in names]
-    a, b, c, d = (np.stack([getattr(loop.form, name) for loop in loops]) for name in "abcd")
-    form = LinearForm(a, b, c, d, ())
-    unstable = np.asarray(in_right_half(np.linalg.eigvals(form.a)).any(axis=1))
-    starts = {name: np.stack([loop.starts[name] for loop in loops]) for name in plans}
-    return {name: _outputs(form, rows, plan, times, starts[name]) for name, plan in plans.items()}, unstable
+
+    labels: tuple[str, ...]
+    form: LinearForm
+    starts: dict[str, Array]
+
+    @classmethod
+    def of(
+        cls, loops: Sequence[Linear], held: Mapping[str, Array], duration: float, initial_state: ArrayLike | None
+    ) -> tuple[Together, NDArray[np.intp]]:
+        """Loops that can be solved together, and their indices; `simulate` reports on the others.
+
+        Parameters
+        ----------
+        loops : sequence of Linear
+            The loops.
+        held : mapping of str to ndarray, shape (naxes,)
+            First position of each plan.
+        duration : float
+            Length of the run [s].
+        initial_state
+            As for `compare`.
+
+        Raises
+        ------
+        ValueError
+            If an algebraic loop has no unique solution, or the initial state does not fit.
+        """
+        form = stacked_form([loop.parts for loop in loops])
+        usable = ~form.is_sensitive(duration)
+        if initial_state is not None:
+            state = np.broadcast_to(real_array(initial_state, "initial_state"), form.a.shape[:2])
+            starts = dict.fromkeys(held, state)
+        else:
+            each = [LinearForm(*matrices, ()) for matrices in zip(form.a, form.b, form.c, form.d, strict=True)]
+            starts = {
+                name: np.array([equilibrium_of(one, position) for one in each]) for name, position in held.items()
+            }
+            usable &= _at_rest(form, starts, held)
+        chosen = np.flatnonzero(usable)
+        a, b, c, d = (matrices[chosen] for matrices in (form.a, form.b, form.c, form.d))
+        kept = {name: state[chosen] for name, state in starts.items()}
+        return cls(loops[0].labels, LinearForm(a, b, c, d, ()), kept), chosen
+
+    def is_unstable(self) -> NDArray[np.bool_]:
+        """Whether each loop is unstable, shape (nloops,)."""
+        return np.asarray(in_right_half(self.form.poles).any(axis=1))
+
+    def outputs(self, names: Sequence[str], plans: Mapping[str, Trajectory], times: Array) -> dict[str, Array]:
+        """Outputs of the loops by plan, shape (nloops, nnames, ntime).
+
+        Parameters
+        ----------
+        names : sequence of str
+            Outputs wanted.
+        plans : mapping of str to Trajectory
+            The plans at the inputs.
+        times : ndarray, shape (ntime,)
+            Sample times [s].
+        """
+        rows = [self.labels.index(name) for name in names]
+        return {name: _outputs(self.form, rows, plan, times, self.starts[name]) for name, plan in plans.items()}
+
+
+def _at_rest(form: LinearForm, starts: Mapping[str, Array], held: Mapping[str, Array]) -> NDArray[np.bool_]:
+    """Whether states are equilibria with the plans held at their first positions, shape (nloops,)."""
+    found = np.ones(len(form.a), dtype=bool)
+    for name, position in held.items():
+        states = starts[name][..., None]
+        moved = (form.a @ states)[..., 0] + form.b @ position
+        terms = (np.abs(form.a) @ np.abs(states))[..., 0] + np.abs(form.b) @ np.abs(position)
+        found &= ~np.any(np.abs(moved) > 1e-6 * terms.max(axis=1, keepdims=True, initial=0.0), axis=1)
+    return found
 
 
 def _outputs(form: LinearForm, rows: list[int], plan: Trajectory, times: Array, initial: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -37,8 +38,8 @@ class Batches(Generic[T, R]):
     alone : callable
         Maps a loop to its outcome.
     alike : callable or None
-        Maps linear loops of the same structure to the outcome of each; None if
-        every loop is run separately.
+        Maps linear loops of the same structure to the outcome of each, None for
+        loops that must be run separately. None if every loop must be.
     first : int
         Number of loops solved together at first.
     """
@@ -46,7 +47,7 @@ class Batches(Generic[T, R]):
     experiment: Experiment
     build: Callable[[T], System | Builder]
     alone: Callable[[System | Builder], R]
-    alike: Callable[[Sequence[Linear]], Sequence[R]] | None
+    alike: Callable[[Sequence[Linear]], Sequence[R | None]] | None
     first: int = FIRST
     _checked: bool = False
 
@@ -56,18 +57,22 @@ class Batches(Generic[T, R]):
         The first linear loop in a process is run separately, which checks the
         arguments for the loop. After a KeyboardInterrupt, outcomes of loops already built follow.
         """
-        waiting: dict[int, Linear] = {}
+        waiting: dict[int, tuple[Linear, System]] = {}
         size = self.first
         largest = max(2, _SAMPLES // max(1, self.experiment.timepts.size))
 
+        def alone(k: int, linear: Linear, loop: System) -> R | Failed:
+            if linear.is_of(loop):
+                return tried(self.alone, loop, timeout)
+            return tried(lambda value: self.alone(self.build(value)), values[k], timeout)  # modified since then
+
         def together() -> Iterator[tuple[int, R | Failed]]:
             nonlocal size
-            try:
-                found = self.alike(list(waiting.values())) if self.alike is not None and waiting else []
-                yield from zip(waiting, found, strict=True)
-            except Exception:  # of one of them: run each separately
-                for k in waiting:
-                    yield k, tried(lambda value: self.alone(self.build(value)), values[k], timeout)
+            found: Sequence[R | None] = [None] * len(waiting)
+            with suppress(Exception):  # of one of them, which is raised when it is run separately
+                found = self.alike([linear for linear, _ in waiting.values()]) if self.alike and waiting else found
+            for (k, (linear, loop)), outcome in zip(waiting.items(), found, strict=True):
+                yield k, alone(k, linear, loop) if outcome is None else outcome
             waiting.clear()
             size = min(2 * size, largest)
 
@@ -80,9 +85,9 @@ class Batches(Generic[T, R]):
                     self._checked |= linear is not None and not isinstance(outcome, Failed)
                     yield k, outcome
                     continue
-                if waiting and not linear.fits(next(iter(waiting.values()))):
+                if waiting and not linear.fits(next(iter(waiting.values()))[0]):
                     yield from together()
-                waiting[k] = linear
+                waiting[k] = linear, loop
                 if len(waiting) >= size:
                     yield from together()
             yield from together()

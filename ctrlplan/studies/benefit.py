@@ -295,14 +295,15 @@ class _Setting:
         """Run plans through waypoints; the simulated time is extended for longer plans."""
         times, late = self.experiment.timepts, points[-1].time - self.reference.end
         more = np.arange(times[-1], times[-1] + max(late, 0.0), np.median(np.diff(times)))[1:]
+        loop, followed = _followable(self.loop, plans)
         experiment = replace(
             self.experiment,
-            plans=_followable(self.loop, plans),
+            plans=followed,
             timepts=np.concatenate([times, more]),
             waypoints=points,
             measures=measures,
         )
-        return experiment, experiment.run(self.loop)
+        return experiment, experiment.run(loop)
 
     def rows(self, factor: float, decisive: Sequence[str]) -> tuple[dict[str, dict[str, float]], list[str]]:
         """Metrics of trigonometric plans, by alpha, and of baselines at another duration; names of the latter.
@@ -363,22 +364,20 @@ def _only(chosen: Chosen, decisive: Sequence[str]) -> Chosen:
     return (*wanted, *(name for name in decisive if name in MEASURES))
 
 
-def _followable(loop: System | Builder, plans: dict[str, Trajectory]) -> dict[str, Trajectory]:
-    """Plans for which the loop can be built."""
+def _followable(loop: System | Builder, plans: dict[str, Trajectory]) -> tuple[System | Builder, dict[str, Trajectory]]:
+    """Loop, built for each plan, and the plans for which it can be built."""
     if not is_builder(loop):
-        return plans
-    found = {}
+        return loop, plans
+    built: dict[str, System] = {}
     error = None
     for name, plan in plans.items():
         try:
-            loop(name, plan)
+            built[name] = loop(name, plan)
         except ValueError as reason:
             error = error or reason
-            continue
-        found[name] = plan
-    if error is not None and not found:
+    if error is not None and not built:
         raise error
-    return found
+    return lambda name, _: built[name], {name: plans[name] for name in built}
 
 
 def _scaled(points: Sequence[Waypoint], factor: float) -> tuple[Waypoint, ...]:

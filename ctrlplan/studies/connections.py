@@ -42,7 +42,8 @@ def check_reached(system: System, outputs: Sequence[str], plan: Trajectory | Non
         `outputs`, another source inside affects no output at all, or an input
         for a derivative of a source is not connected.
     """
-    structure = None if isinstance(system, Prepared) else _structure(system)
+    original = system.original if isinstance(system, Prepared) else system
+    structure = None if original is None else _structure(original)
     if structure is None:
         _check_network(system, outputs, plan)
     else:  # many loops of a sweep differ in numbers only

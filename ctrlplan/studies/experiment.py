@@ -17,7 +17,7 @@ from ctrlplan._display import Displayed, Facts, Part, counted, title_of
 from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event
 from ctrlplan.simulation.built_forms import shared_forms
-from ctrlplan.studies.alike import Linear, numbers_of, outputs_together
+from ctrlplan.studies.alike import Linear, Together, numbers_of
 from ctrlplan.studies.checkpoint import digest
 from ctrlplan.studies.measures import (
     Chosen,
@@ -303,7 +303,7 @@ class Experiment(Displayed):
         )
 
     def numbers_of(self, loop: System | Builder) -> Linear | None:
-        """Matrices of a linear loop, for `run_alike`.
+        """Numbers of a linear loop, for `run_alike`.
 
         Returns
         -------
@@ -313,8 +313,7 @@ class Experiment(Displayed):
         """
         if is_builder(loop) or self._held is None:
             return None
-        first, duration = next(iter(self.plans.values())), float(self.timepts[-1] - self.timepts[0])
-        return numbers_of(loop, first, self._held, duration, self.outputs, self.controls, self.initial_state)
+        return numbers_of(loop, next(iter(self.plans.values())), self.outputs, self.controls)
 
     @cached_property
     def _held(self) -> dict[str, Array] | None:
@@ -327,7 +326,7 @@ class Experiment(Displayed):
 
     def run_alike(
         self, loops: Sequence[System | Linear], samples: NDArray[np.intp] | None = None
-    ) -> list[Measured] | None:
+    ) -> list[Measured | None] | None:
         """Solve linear loops together with every plan, with the same metrics as `run`.
 
         Parameters
@@ -339,19 +338,23 @@ class Experiment(Displayed):
 
         Returns
         -------
-        list of Measured, or None
-            Without runs. None if one of the loops must be run separately.
+        list of Measured or None, or None
+            Without runs; None for each loop that must be run separately, as it does
+            not start at equilibrium or amplifies rounding errors. None in place of
+            the list if one of the loops has no numbers, or another structure.
         """
         numbers = [loop if isinstance(loop, Linear) else self.numbers_of(loop) for loop in loops]
         alike = [loop for loop in numbers if loop is not None]
-        if not alike or len(alike) < len(numbers) or not all(loop.fits(alike[0]) for loop in alike):
+        held, duration = self._held, float(self.timepts[-1] - self.timepts[0])
+        if held is None or not alike or len(alike) < len(numbers) or not all(loop.fits(alike[0]) for loop in alike):
             return None
+        together, usable = Together.of(alike, held, duration, self.initial_state)
         tracked = alike[0].tracked
         acting = alike[0].acting if samples is not None or self._listed("control") else ()
-        signals, unstable = outputs_together(alike, (*tracked, *acting), self.plans, self.timepts)
-        found: list[Metrics] = [{} for _ in alike]
-        stored: list[dict[str, dict[str, Array]]] = [{} for _ in alike]
-        for name, plan in self.plans.items():
+        signals, unstable = together.outputs((*tracked, *acting), self.plans, self.timepts), together.is_unstable()
+        found: list[Metrics] = [{} for _ in usable]
+        stored: list[dict[str, dict[str, Array]]] = [{} for _ in usable]
+        for name, plan in self.plans.items() if usable.size else ():
             rows = signals.pop(name)
             for i, curves in enumerate(stored) if samples is not None else ():
                 curves[name] = dict(zip((*tracked, *acting), rows[i][:, samples], strict=True))
@@ -359,7 +362,10 @@ class Experiment(Displayed):
             values = self._metrics_of_rows(SignalRecord(self.timepts, y, u, self.axes, acting, unstable), plan)
             for metrics, own in zip(found, values, strict=True):
                 metrics[name] = own
-        return [Measured(metrics, signals=curves) for metrics, curves in zip(found, stored, strict=True)]
+        results: list[Measured | None] = [None] * len(alike)
+        for i, metrics, curves in zip(usable, found, stored, strict=True):
+            results[i] = Measured(metrics, signals=curves)
+        return results
 
     def metrics_of_runs(self, runs: Sequence[Run]) -> list[dict[str, float]]:
         """Metrics of runs of one loop with one plan and different parameters; without measures of the user."""

@@ -340,10 +340,13 @@ def _of_loop(experiment: Experiment, samples: Samples, loop: System | Builder) -
     return _outcome(dict.fromkeys(experiment.plans, loop), experiment, samples, experiment.plans, None)
 
 
-def _alike(experiment: Experiment, samples: Samples, loops: Sequence[Linear]) -> list[Outcome]:
-    """Outcomes of linear loops of the same structure."""
+def _alike(experiment: Experiment, samples: Samples, loops: Sequence[Linear]) -> list[Outcome | None]:
+    """Outcomes of linear loops of the same structure; None for those that must be run separately."""
     found = experiment.run_alike(loops, samples) or ()
-    return [{plan: (metrics, one.signals[plan]) for plan, metrics in one.metrics.items()} for one in found]
+    return [
+        None if one is None else {plan: (metrics, one.signals[plan]) for plan, metrics in one.metrics.items()}
+        for one in found
+    ]
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from ctrlplan.simulation import (
     Prepared,
     check_begin,
     equilibrium_at,
-    prepared_form,
     simulate,
     state_space,
+    unchanged,
     unstable_poles,
 )
 from ctrlplan.studies.connections import check_reached
@@ -74,31 +74,31 @@ def run_plan(
     """
     system = state_space(loop(name, plan) if is_builder(loop) else loop)
     tracked, acting = _tracked(system, outputs, axes), acting_outputs(system, controls)
-    check_reached(system, tracked, plan)
-    state, doubt = initial_state, ""
-    if state is None and times.ndim == 1 and times.size and np.isfinite(times).all():  # otherwise simulate raises
-        check_begin(prepared_form(system).starts, float(times[0]), True)
-        rows = [system.output_labels.index(label) for label in tracked]
-        state, why = equilibrium_at(system, plan, float(times[0]), rows, params)
-        doubt = f"{name}: {_doubt(plan, times, state, why)}." if why else ""
-    inputs, start = (plan if system.ninputs else None), (0.0 if state is None else state)
-    try:
-        response = simulate(system, times, inputs, initial_state=start, params=params, events=events)
-    except Exception as error:
-        if doubt:
-            error.add_note(doubt)
-        raise
+    with unchanged(system) as ready:
+        check_reached(ready, tracked, plan)
+        state, doubt = initial_state, ""
+        if state is None and times.ndim == 1 and times.size and np.isfinite(times).all():  # otherwise simulate raises
+            check_begin(ready.starts, float(times[0]), True)
+            rows = [system.output_labels.index(label) for label in tracked]
+            state, why = equilibrium_at(ready, plan, float(times[0]), rows, params)
+            doubt = f"{name}: {_doubt(plan, times, state, why)}." if why else ""
+        inputs, start = (plan if ready.ninputs else None), (0.0 if state is None else state)
+        try:
+            response = simulate(ready, times, inputs, initial_state=start, params=params, events=events)
+        except Exception as error:
+            if doubt:
+                error.add_note(doubt)
+            raise
     if doubt:
         warnings.warn(doubt, UserWarning, stacklevel=outside_stacklevel())
     early = response.time[-1] < times[-1]
     stop = next(event for event in response.events if event.stop) if early else None
-    return Run(plan, system, response, tracked, acting, last, _unstable(system), doubt, stop)
+    return Run(plan, system, response, tracked, acting, last, _unstable(ready), doubt, stop)
 
 
-def _unstable(system: System) -> NDArray[np.complex128] | None:
-    """Poles in the right half plane; None if the loop is nonlinear and none are known."""
-    poles = unstable_poles(system)
-    return poles if poles.size or prepared_form(system).linear is not None else None
+def _unstable(system: Prepared) -> NDArray[np.complex128] | None:
+    """Poles in the right half plane; None if the loop is nonlinear."""
+    return unstable_poles(system) if system.linear is not None else None
 
 
 def _doubt(plan: Trajectory, times: Array, state: Array, why: str) -> str:

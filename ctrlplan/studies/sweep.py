@@ -468,9 +468,9 @@ def _metrics(experiment: Experiment, units: Mapping[str, str] | None, loop: Syst
     return found.metrics
 
 
-def _metrics_alike(experiment: Experiment, loops: Sequence[Linear]) -> list[Metrics]:
-    """Metrics of linear loops of the same structure."""
-    return [one.metrics for one in experiment.run_alike(loops) or ()]
+def _metrics_alike(experiment: Experiment, loops: Sequence[Linear]) -> list[Metrics | None]:
+    """Metrics of linear loops of the same structure; None for those that must be run separately."""
+    return [None if one is None else one.metrics for one in experiment.run_alike(loops) or ()]
 
 
 def settling_jumps(values: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
 from ctrlplan import metrics
-from ctrlplan.metrics._pieces import shared
+from ctrlplan.metrics._pieces import pieces, shared
 
 UNEVEN = np.array([-1.0, -0.7, 0.1, 0.3, 0.9, 1.0, 1.8, 2.5])
 
@@ -159,3 +159,32 @@ def test_metrics_that_share_cubics_are_those_alone(count):
         found += [function(t, held) for function in functions]
     for one, other in zip(found, alone, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+SIGNALS = {
+    "smooth": lambda t: np.exp(-0.3 * t) * np.cos(7.0 * t),
+    "kinks and jumps": lambda t: (
+        np.where(t < 1.0, np.abs(np.sin(5.0 * t)), np.maximum(np.cos(9.0 * t), -0.4)) - (t > 2.0)
+    ),
+    "noise": lambda t: np.random.default_rng(3).standard_normal(t.size),
+    "far from zero": lambda t: 1e6 + np.sin(t),
+}
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("kind", SIGNALS)
+def test_integrals_and_peaks_of_long_signals_are_those_of_every_cubic(kind, spread):
+    """Gauss-Legendre quadrature is exact for squares of cubics; no sample of a cubic exceeds the peak."""
+    t = np.linspace(0.0, 3.0, 800)
+    t[1:-1] += spread * t[1] * np.random.default_rng(1).uniform(-0.5, 0.5, 798)
+    f = SIGNALS[kind](t)
+    cubics, (nodes, weights) = pieces(t, f), np.polynomial.legendre.leggauss(4)
+    expected = sum(
+        weight / 2 * np.sum(cubics.step * cubics.held((node + 1) / 2) ** 2)
+        for node, weight in zip(nodes, weights, strict=True)
+    )
+    rounding = 64 * np.finfo(float).eps * np.sqrt(t.size)
+    assert metrics.ise(t, f) == pytest.approx(expected, rel=rounding)
+    between = np.abs(cubics(np.linspace(0.0, 1.0, 201)[:, None])).max()
+    bend = np.abs(cubics.c).max() + 3 * np.abs(cubics.d).max()
+    assert between - 1e-14 * np.abs(f).max() <= metrics.peak(t, f) <= between + 0.5 * (0.5 / 200) ** 2 * 2 * bend
