@@ -309,7 +309,7 @@ def test_riccati_law_costs_no_more_than_gains_scheduled_on_speed():
     theirs = ct.interconnect([block, car], inputs=0, outputs=names, name="scheduled")
     start = CAR.states_and_inputs(plan, 0.0)[0] + [0.0, 0.4, 0.0]
     ours = cp.flat_loop(CAR, plan, law=cp.TVLQR(q, r, final=final), initial_state=start)
-    t = np.linspace(0.0, 6.0, 601)
+    t = np.linspace(0.0, 6.0, 121)
     wanted = np.concatenate(CAR.states_and_inputs(plan, t))
     costs = []
     for loop in (ours, theirs):
