@@ -162,14 +162,14 @@ def check_global(seed, family, name, count):
 )
 @pytest.mark.parametrize("name", ["path", "peak_acceleration", "squared_jerk"])
 def test_random_waypoints_have_no_better_alpha(seed, name):
-    check_global(seed, cp.PiecewiseSpline if seed == 3 else cp.TrigSpline, name, 120)
+    check_global(seed, cp.PiecewiseSpline if seed == 3 else cp.TrigSpline, name, 60)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [100, 105, 122, 129])
+@pytest.mark.parametrize("seed", [100, 105])
 @pytest.mark.parametrize("name", ["path", "peak_velocity", "peak_jerk", "squared_velocity", "squared_snap"])
 def test_many_random_waypoints_have_no_better_alpha(seed, name):
-    check_global(seed, cp.PiecewiseSpline if seed % 3 == 0 else cp.TrigSpline, name, 300)
+    check_global(seed, cp.PiecewiseSpline if seed % 3 == 0 else cp.TrigSpline, name, 150)
 
 
 @pytest.mark.parametrize("name", ["path", "wandering"])

@@ -211,7 +211,7 @@ def test_a_closed_loop_is_sampled():
     assert found.coverage.startswith("sampled, ")
     assert found.note == "exact, at all times"
     worst = by_name(found)
-    for values in draws(40, ranges):
+    for values in draws(15, ranges):
         own = by_name(margins(MOVE, {"y": (-0.5, 1.5), "u": 1.0}, servo(**values)))
         for name, row in own.items():
             assert row.fraction >= worst[name].fraction - 0.02

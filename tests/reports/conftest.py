@@ -88,12 +88,19 @@ def run(name, folder, *arguments):
     return Written(name, folder, done.stdout, done.stderr)
 
 
+def reported(name, study, folder):
+    """Report of a study file, by the command in this process."""
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        assert main(["report", str(study), "--out", str(folder)]) == 0, err.getvalue()
+    return Written(name, folder, out.getvalue(), err.getvalue())
+
+
 @pytest.fixture(scope="session")
 def own(tmp_path_factory):
     """A user's own study, reported."""
     place = tmp_path_factory.mktemp("own")
     (place / "hoist.toml").write_text(OWN, encoding="utf-8")
-    return run("own", place / "report", "report", place / "hoist.toml")
+    return reported("own", place / "hoist.toml", place / "report")
 
 
 @pytest.fixture(scope="session")
@@ -108,9 +115,7 @@ def unstable(tmp_path_factory):
     place = tmp_path_factory.mktemp("unstable")
     text = OWN.replace("gain = 5.0", "gain = -5.0").replace('"gentle"', "\"a <b> & 'c' --> d\"")
     (place / "a strange name.toml").write_text(text, encoding="utf-8")
-    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
-        assert main(["report", str(place / "a strange name.toml"), "--out", str(place / "report")]) == 0
-    return Written("unstable", place / "report", out.getvalue(), err.getvalue())
+    return reported("unstable", place / "a strange name.toml", place / "report")
 
 
 @pytest.fixture(scope="session", params=["own", "unstable", pytest.param("reproduced", marks=pytest.mark.slow)])

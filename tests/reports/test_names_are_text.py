@@ -101,7 +101,7 @@ def drawn_page(offset):
     return render_page([study(mixed(offset))], "page")
 
 
-OFFSETS = pytest.mark.parametrize("offset", range(0, len(TEXTS), 15))
+OFFSETS = pytest.mark.parametrize("offset", range(0, len(TEXTS), 22))
 
 
 @pytest.mark.slow

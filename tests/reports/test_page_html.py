@@ -375,6 +375,7 @@ def several():
     return [Study(name, f"The {name} loop", cp.compare(loop, move, times)) for name, loop in loops.items()]
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_several_studies_stand_apart_and_are_found_from_the_top(several, read):
     tree = read(render_page(several, "Both"))

@@ -299,6 +299,7 @@ def test_limits_that_no_plan_can_keep_have_a_page(study, shown):
     assert not list(table.all("td", class_="better"))
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_a_worth_without_needs_or_tables_has_a_page(study, shown):
     bare = Benefit(study.comparison.benefit.comparison, {}, (), (), 1.0)

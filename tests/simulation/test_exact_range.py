@@ -296,7 +296,7 @@ def test_nothing_is_said_of_stiff_systems_that_keep_their_digits(kind):
 
 
 @pytest.mark.parametrize("kind", ["step", "samples"])
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", range(8))
 def test_random_chains_up_to_and_beyond_the_range_of_numbers(kind, seed, monkeypatch):
     """Stable and unstable states in any order, from zero, tiny and huge states."""
     # Triangular as they are: a zero must stay one where others grow beyond the oracle's digits.

@@ -182,7 +182,7 @@ sys.modules["casadi"] = None
 import numpy as np, ctrlplan as cp
 from ctrlplan.studies.crane import CRANE, obstacle_waypoints
 plan = cp.TrigSpline(obstacle_waypoints(), alpha=4.0)
-found = cp.simulate(cp.plants.crane_loop(CRANE, plan), np.linspace(0.0, 20.0, 41))
+found = cp.simulate(cp.plants.crane_loop(CRANE, plan), np.linspace(0.0, 4.0, 9))
 assert found.method == "python" and "pip install ctrlplan[fast]" in found.reason, found.reason
 plans = {"trigonometric": plan}
 spread = cp.monte_carlo(lambda n, p: cp.plants.crane_loop(CRANE, p), {"load_mass": [400.0, 600.0]},

@@ -262,7 +262,7 @@ def test_a_crane_whose_law_feeds_the_load_back():
     rest[3] = 10.0
     rest[-6:] = crane.equilibrium(0.0, 10.0)[0]
     limits = {"theta": (-0.06, 0.06), "F": (-6000.0, 6000.0)}
-    governor = cp.create_governor_iosystem(cp.Predictor(loop, limits, 40.0), 0.5, initial=[0.0, 10.0])
+    governor = cp.create_governor_iosystem(cp.Predictor(loop, limits, 40.0), 1.0, initial=[0.0, 10.0])
     outputs = [*plant.output_labels, "F", "C", "x_set", "z_set"]
     requested = ["x_set_cmd", "z_set_cmd"]
     whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=requested, outputs=outputs)

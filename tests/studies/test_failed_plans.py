@@ -53,11 +53,13 @@ def headline_of(page):
     return line
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_the_headline_names_it(compared):
     assert "Failed, without values: far." in headline_of(render_page([Study("one", "One", compared)], "Page"))
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_the_headline_names_plans_whose_runs_an_event_ended():
     """Ramps from 0 to 1 pass 0.5 at half of their duration."""
@@ -77,6 +79,7 @@ def at_rate(rate):
     )
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_the_headline_of_a_sweep_and_of_draws_tells_how_many_failed(tmp_path):
     options = {"initial_state": [0.0], "progress": False}

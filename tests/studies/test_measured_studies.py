@@ -134,6 +134,7 @@ def test_the_schema_knows_the_tables():
         assert structure_error(valid(measured={"poly": wrong}))
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_cranes_have_measured_runs(tmp_path):
     points = [{"time": t, "x": [x, 0.0, 0.0], "z": [z, 0.0, 0.0]} for t, x, z in ((0.0, 0.0, 10.0), (12.0, 5.0, 9.0))]

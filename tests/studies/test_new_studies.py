@@ -63,7 +63,7 @@ def test_there_is_a_kind_for_each_loop_and_each_way_of_planning():
 EVERYDAY = {"linear", "crane", "draws", "kinematic-car"}
 
 
-@pytest.mark.usefixtures("drawn_if_slow")
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.parametrize(
     "kind",
     [

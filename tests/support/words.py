@@ -143,28 +143,29 @@ def in_name(name):
 
 def strings(tree):
     """Nodes of string constants: docstrings, and the others but for old names in calls of what `_renamed` defines."""
+    nodes = list(ast.walk(tree))
     docstrings = [
         node.value
-        for node in ast.walk(tree)
+        for node in nodes
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
     ]
     skipped = {id(node) for node in docstrings}
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Call) and re.search(r"renamed|former", ast.unparse(node.func)):
             skipped |= {id(inner) for inner in ast.walk(node)}
     others = [
         node
-        for node in ast.walk(tree)
+        for node in nodes
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in skipped
     ]
     return docstrings, others
 
 
-def deprecated(tree):
+def deprecated(tree, text):
     """Names of the functions that stand for a new name and warn."""
     return {
         node.name
-        for node in ast.walk(tree)
+        for node in ([] if "Deprecated name of" not in text else ast.walk(tree))
         if isinstance(node, ast.FunctionDef) and (ast.get_docstring(node) or "").startswith("Deprecated name of")
     }
 
@@ -173,7 +174,7 @@ def in_module(path):
     """Each word found in a module as (kind, word, line, text)."""
     text = path.read_text(encoding="utf-8")
     tree = ast.parse(text)
-    old = deprecated(tree)
+    old = deprecated(tree, text)
     docstrings, others = strings(tree)
     found = [("docstring", word, node.lineno, node.value) for node in docstrings for word in in_text(node.value)]
     found += [("string", word, node.lineno, node.value) for node in others for word in in_text(node.value)]

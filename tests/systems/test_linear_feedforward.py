@@ -276,7 +276,7 @@ def test_feedforward_of_the_plant_is_added_to_a_controller_with_zeros():
     np.testing.assert_allclose(cp.simulate(loop, t).outputs.ravel(), plan(t), atol=3e-9)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(5))
 def test_no_zero_is_missed(seed):
     rng = np.random.default_rng(seed)
     order = int(rng.integers(2, 7))
