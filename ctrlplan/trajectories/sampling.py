@@ -146,7 +146,7 @@ def sample_segments(
     times : ndarray, shape (nsegments + 1,)
         Breakpoints [s].
     rows_of : callable
-        Maps numbers of segments (n,) to the rows (n, norders * naxes, size) of their
+        Maps increasing numbers of segments (n,) to the rows (n, norders * naxes, size) of their
         interpolants, and to whether these are certainly finite.
     entries : ndarray, shape (nsegments + 1, k, naxes)
         Lowest derivatives at the breakpoints, as far as they are prescribed there;
