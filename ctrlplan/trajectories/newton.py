@@ -215,9 +215,11 @@ class NewtonSystem(Fields):
         if self._inverse is None or taylor_data.dtype != np.float64:
             return self.coefficients_of(taylor_data)
         offset = taylor_data[self._anchor].copy()
-        for row, order in zip(taylor_data, self._orders, strict=True):
-            if not order:
-                row -= offset
+        count = self._orders.count(0)
+        if any(self._orders[:count]):
+            taylor_data[self.order_index == 0] -= offset
+        else:
+            taylor_data[:count] -= offset
         found: Array = self._inverse @ taylor_data
         found[0] += offset
         return found

@@ -107,7 +107,10 @@ class Pieces(Fields):
         return all([run.system.interpolant(low, high) is not None for run in self.runs])
 
     def rows(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
-        """Coefficients (nsegments, high - low + 1, naxes, nterms) of interpolants by relative time, if resolved."""
+        """Coefficients (nsegments, high - low + 1, naxes, nterms) of interpolants by relative time, if resolved.
+
+        Numbers of segments must increase.
+        """
         found = []
         for run in self.runs:
             basis = run.system.interpolant(low, high)
@@ -256,7 +259,9 @@ def fitted(
 
 def _rows(run: Run, basis: Array, segments: NDArray[np.intp]) -> Array:
     """Interpolants of segments of a run, from those of the basis (norders, size, nterms)."""
-    coefficients = run.coefficients[:, :, segments - run.first].transpose(2, 1, 0)
+    coefficients = run.coefficients.T
+    if segments.size < len(coefficients):
+        coefficients = coefficients[segments - run.first]
     return np.asarray(coefficients[:, None] @ basis)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal, Self
 
 import numpy as np
@@ -441,7 +441,8 @@ class PiecewiseSpline(WaypointSpline):
     @cached_property
     def _exponent(self) -> float:
         """Maximum magnitude of the decimal exponents of the durations."""
-        return max(abs(math.log10(self._durations.min())), abs(math.log10(self._durations.max())))
+        durations = self._durations
+        return max(abs(math.log10(durations.min())), abs(math.log10(durations.max())))
 
     def _jets(self, segments: NDArray[np.intp], s: Array, low: int, high: int) -> Array:
         """Derivatives low to high, each time in its own segment."""
@@ -527,8 +528,8 @@ class PiecewiseSpline(WaypointSpline):
             out = np.zeros((segments.size, high - low + 1, self.naxes, max(rows.shape[3] for rows in found)))
             for pieces, rows in zip(self._pieces, found, strict=True):
                 out[:, :, list(pieces.axes), : rows.shape[3]] = rows
-        scale = self._durations[segments, None] ** -np.arange(low, high + 1.0)
-        return (out * scale[:, :, None, None]).reshape(segments.size, -1, out.shape[3])
+        powers = self._durations[segments, None, None, None] ** _exponents(low, high)
+        return (out * powers).reshape(segments.size, -1, out.shape[3])
 
     _rows = WaypointSpline._rows  # `_sample` calls it
 
@@ -554,7 +555,8 @@ class PiecewiseSpline(WaypointSpline):
 
     @cached_property
     def _durations(self) -> Array:
-        return readonly(np.diff(self.breakpoints))
+        times = self.breakpoints
+        return readonly(times[1:] - times[:-1])
 
     def stationary_places(self, nu: int) -> tuple[NDArray[np.intp], Array] | None:
         """Places of the stationary points of polynomials; as `Trajectory.stationary_places`."""
@@ -588,6 +590,12 @@ class PiecewiseSpline(WaypointSpline):
     def _facts(self) -> list[tuple[str, str]]:
         alpha = ("alpha", f"{number(self.alpha)} rad" if self.alpha else "")
         return [*super()._facts(), alpha, ("period", "" if self._period is None else f"{number(self._period)} s")]
+
+
+@lru_cache(maxsize=128)
+def _exponents(low: int, high: int) -> Array:
+    """Exponents (norders, 1, 1) of durations in derivatives."""
+    return readonly(-np.arange(low, high + 1.0)[:, None, None])
 
 
 def _range(run: Run, segments: slice | NDArray[np.intp]) -> tuple[Array, Array]:

@@ -24,7 +24,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,7 @@ _MAX_TERMS = 24
 _PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
 _CHUNK = 4104  # the functions stay in the second cache; no power of two, to avoid conflicts between rows
 _SPARSE = 48  # number of times per segment from which a matrix product for each segment is faster
+_COMPARED = 18  # number of breakpoints up to which comparisons with each are faster than searches
 _BLOCK = 16 * _CHUNK  # number of times that are grouped together
 _LARGEST = 2.0**20  # bound of all functions of the bases
 
@@ -146,7 +147,7 @@ def sample_segments(
     times : ndarray, shape (nsegments + 1,)
         Breakpoints [s].
     rows_of : callable
-        Maps numbers of segments (n,) to the rows (n, norders * naxes, size) of their
+        Maps increasing numbers of segments (n,) to the rows (n, norders * naxes, size) of their
         interpolants, and to whether these are certainly finite.
     entries : ndarray, shape (nsegments + 1, k, naxes)
         Lowest derivatives at the breakpoints, as far as they are prescribed there;
@@ -166,13 +167,16 @@ def sample_segments(
         if is_sorted:
             finite &= _sample_sorted_block(times, rows_of, entries, part, left, place)
         else:
-            segments = _segments_of(times, part, left)
-            order = segments.astype(np.uint16 if times.size < 2**16 else np.intp).argsort(kind="stable")
+            segments = _segments_of_unsorted(times, part, left)
+            order = segments.argsort(kind="stable")
             counts = np.bincount(segments)
             used = counts.nonzero()[0]
             found = np.empty(place.shape)
             finite &= _sample_grouped(times, rows_of, entries, part[order], left, used, counts[used], found)
-            place[:, :, order] = found
+            back = np.empty_like(order)
+            back[order] = np.arange(order.size)
+            for values, target in zip(found.reshape(-1, part.size), out.reshape(-1, t.size), strict=True):
+                values.take(back, out=target[begin : begin + part.size], mode="clip")  # which needs no copy
     return finite
 
 
@@ -180,6 +184,16 @@ def _segments_of(times: Array, t: Array, left: bool) -> NDArray[np.intp]:
     """Segment of each time."""
     found = times[1:-1].searchsorted(t, side="left" if left else "right")
     return np.asarray(found)
+
+
+def _segments_of_unsorted(times: Array, t: Array, left: bool) -> NDArray[np.integer[Any]]:
+    """The same, of a type with few bytes, which is sorted fast."""
+    if times.size > _COMPARED:
+        return _segments_of(times, t, left).astype(np.uint16 if times.size < 2**16 else np.intp)
+    found = np.zeros(t.size, dtype=np.uint8)
+    for moment in times[1:-1].tolist():
+        found += (t > moment if left else t >= moment).view(np.uint8)
+    return found
 
 
 def _sample_sorted_block(

@@ -6,6 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 from numpy.polynomial import chebyshev
+from scipy.interpolate import BPoly
 from trajectory_oracle import Direct, waypoints
 
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, TrigSpline, Waypoint, sampling, stack
@@ -253,6 +254,45 @@ def test_functions_between_nodes_in_fifty_digits(alpha):
         assert found.shape == (order + 1, system.size, u.size)
         size = np.abs(exact[: order + 1]).max(axis=2, keepdims=True)
         assert (np.abs(found - exact[: order + 1]) <= 20 * EPS * size).all()
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1e-9, 0.7, 3.0, 2 * np.pi])
+def test_series_at_waypoints_in_turn_are_those_of_all_times(alpha):
+    """The factors of the pairs as matrices; with other orders at each waypoint, more functions, and gamma."""
+    rng = np.random.default_rng(3)
+    for given, options in (
+        (((0, 1, 2),) * 4, {}),
+        (((0,),), {}),
+        (((0, 1), (0,), (0, 1, 2, 3)), {}),
+        (((0, 1), (0, 1)), {"size": 6}),
+        (((0, 1, 2), (0, 1, 2)), {"gamma": 0.3} if alpha > 1.0 else {}),
+    ):
+        times = np.cumsum(rng.uniform(0.2, 1.0, len(given)))
+        times = (times - times[0]) / (times[-1] - times[0] or 1.0)
+        system = NewtonSystem(alpha, times, given, **options)
+        count = system.order_index.size
+        series = system.taylor(times, int(system.order_index.max()))
+        wanted = series[:count, system.order_index, system.waypoint_index].T
+        size = np.abs(series[:count]).max(axis=(1, 2))
+        assert (np.abs(system._triangle - wanted) <= 20 * EPS * size).all()
+
+
+@pytest.mark.parametrize("n", [3, 18, 19, 40])
+@pytest.mark.parametrize("left", [False, True])
+def test_times_in_any_order_of_few_and_many_segments(n, left):
+    """As sorted: to rounding between breakpoints, in every bit at them; against scipy's polynomials."""
+    rng = np.random.default_rng(n)
+    times, rows = np.cumsum(rng.uniform(0.5, 1.5, n)), rng.normal(size=(3, n))
+    plan = PiecewiseSpline.from_arrays(times, rows[0], derivatives={1: rows[1], 2: rows[2]}, warn=False)
+    t = np.sort(np.append(rng.uniform(times[0], times[-1], 100 * n), times[1:]))
+    mixed = rng.permutation(t.size)
+    found, back = plan.jet(t, 2, left=left), np.empty((3, 1, t.size))
+    back[:, :, mixed] = plan.jet(t[mixed], 2, left=left)
+    assert (np.abs(back - found) <= 64 * EPS * np.abs(found).max(axis=2, keepdims=True)).all()
+    at = np.searchsorted(t, times[1:])
+    np.testing.assert_array_equal(back[:, 0, at], rows[:, 1:])
+    exact = BPoly.from_derivatives(times, rows.T)
+    assert np.abs(back[0, 0] - exact(t)).max() <= 1e-13 * np.abs(rows).max()
 
 
 def test_functions_at_nodes_and_of_high_orders_are_those_of_all_times():

@@ -187,6 +187,21 @@ def test_moves_from_rest_to_rest_are_decided_by_the_bound(make, monkeypatch):
     make([Waypoint(0, [0, 1], 0, 0), Waypoint(1, [1, 0], 0, 0)])
 
 
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+@pytest.mark.parametrize("count", [3, 4])
+def test_samples_of_a_sine_are_decided_by_the_bound(alpha, count, monkeypatch):
+    """Three and four waypoints with two derivatives; one that is moved away is measured."""
+    measured = []
+    monkeypatch.setattr(newton_spline, "within", lambda *given: measured.append(given) or True)
+    times = np.linspace(0.3, 0.3 + 1.1 * (count - 1), count)
+    rows = np.sin([times, times + 0.5 * np.pi, times + np.pi])
+    TrigSpline([Waypoint(t, *row) for t, row in zip(times, rows.T, strict=True)], alpha=alpha)
+    assert not measured
+    rows[1, 1] = 100.0
+    TrigSpline([Waypoint(t, *row) for t, row in zip(times, rows.T, strict=True)], alpha=alpha)
+    assert len(measured) == 1
+
+
 def test_the_advice_names_what_to_call():
     points = [Waypoint(float(k), (-1.0) ** k) for k in range(40)]
     with pytest.warns(UserWarning, match="over .* times the range .* PiecewiseSpline, .*or fit for samples"):
