@@ -140,7 +140,7 @@ class Compiled:
         self._integrators: Lru[tuple[object, ...], Segment] = Lru(_CACHE_SIZE)
         self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
         self._small: Lru[tuple[int, str, int], _AtMany] = Lru(_CACHE_SIZE)
-        self._equations: dict[tuple[int, bool], dict[str, ca.SX]] = {}
+        self._equations: dict[tuple[int, bool, bool], dict[str, ca.SX]] = {}
 
     def __getstate__(self) -> dict[str, object]:
         """State without what can be rebuilt."""
@@ -251,7 +251,7 @@ class Compiled:
             "disable_internal_warnings": True,
         }
         grid = np.frombuffer(settings.grid).tolist()
-        equations = self._segment_equations(settings.width, settings.harmonic)
+        equations = self._segment_equations(settings.width, settings.harmonic, settings.scaled)
         with passing_interruptions():
             made = ca.integrator("segment", "cvodes", equations, 0.0, grid, options)
         return Segment(made, self.moving.size)
@@ -269,20 +269,20 @@ class Compiled:
                 at_all = _AtMany(function.map(t.size), t.size)
         return at_all.values(t, x, time_values, p)
 
-    def _segment_equations(self, width: int, harmonic: bool) -> dict[str, ca.SX]:
+    def _segment_equations(self, width: int, harmonic: bool, scaled: bool) -> dict[str, ca.SX]:
         """Equations of scaled states over s in [0, 1], with functions of time as sums of a number of terms.
 
         The states of sampled blocks, which are constant, are among the parameters. Terms are Chebyshev polynomials, or
         harmonics; the fourth number of `span` is then their rate instead of the end of the series.
         """
-        if (width, harmonic) not in self._equations:
+        if (width, harmonic, scaled) not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
             moving = self.moving.tolist()
             shapes = {"s": (1,), "z": (len(moving),), "p": (np_,), "c": (nd, width), "bounds": (nd, 2)}
             shapes |= {"span": (6,), "shift": (len(moving),), "scale": (len(moving),), "start": (nx,)}
             s, z, p, c, bounds, span, shift, scale, start = (ca.SX.sym(name, *shape) for name, shape in shapes.items())
             x = ca.SX(start)
-            x[moving] = shift + scale * z
+            x[moving] = shift + scale * z if scaled else z
             left, length, first, last, earliest, latest = (span[k] for k in range(6))
             t = ca.fmin(ca.fmax(left + s * length, earliest), latest)
             terms = (
@@ -291,16 +291,16 @@ class Compiled:
                 else _chebyshev(2.0 * t - first - last, last - first, width)
             )
             time_values = c @ terms
-            if width > 1:  # nan is preserved
-                time_values = ca.if_else(time_values < bounds[:, 0], bounds[:, 0], time_values)
-                time_values = ca.if_else(time_values > bounds[:, 1], bounds[:, 1], time_values)
-            self._equations[width, harmonic] = {
+            if width > 1:  # the bounds of a signal that is nan are nan
+                time_values = ca.fmin(ca.fmax(time_values, bounds[:, 0]), bounds[:, 1])
+            rates = length * self._rates(t, x, time_values, p)[moving]
+            self._equations[width, harmonic, scaled] = {
                 "t": s,
                 "x": z,
                 "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), shift, scale, span, start),
-                "ode": length * self._rates(t, x, time_values, p)[moving] / scale,
+                "ode": rates / scale if scaled else rates,
             }
-        return self._equations[width, harmonic]
+        return self._equations[width, harmonic, scaled]
 
     def _own_parameters(self, p: ca.SX) -> list[ca.SX]:
         """Entries of p for each block."""
@@ -310,10 +310,11 @@ class Compiled:
 
 
 class Settings(NamedTuple):
-    """What an integrator of a segment is built for: terms of the functions of time, output times (bytes), CVODES."""
+    """What an integrator of a segment is built for: terms of the functions of time, states, output times, CVODES."""
 
     width: int
     harmonic: bool
+    scaled: bool
     grid: bytes
     kind: Kind
     rtol: float
@@ -390,6 +391,7 @@ class CompiledSolver:
         self.form, self._p = equations, equations.parameters(params)
         self._scales, self._max_steps = scales, max_steps
         self._shift, self._scale = scales.shift[self.moving], scales.scale[self.moving]
+        self._scaled = bool(np.any(self._shift != 0.0) or np.any(self._scale != 1.0))
         self._tolerances = float(tolerances.rtol.min(initial=1.0)), tolerances.atol
         self._longest, self._kind, self._segments, self._patterns = 0.0, Kind.ADAMS, 0, 0
         self._motion = Motion(0.0, 0.0)
@@ -470,7 +472,9 @@ class CompiledSolver:
             each = [self._advanced(series, left, grid[k : k + 1], state) for k in range(grid.size)]
             return np.concatenate(each, axis=1)
         if series is not self._series:
-            parts = [self._p, _terms(series).ravel(order="F"), series.low, series.high, self._shift, self._scale]
+            undefined = np.where(np.isfinite(_terms(series)).all(axis=1), 0.0, np.nan)
+            bounds = series.low + undefined, series.high + undefined
+            parts = [self._p, _terms(series).ravel(order="F"), *bounds, self._shift, self._scale]
             self._known, self._series = np.concatenate(parts), series
         last = series.right if series.harmonics is None else series.harmonics.rate
         span = (left, right - left, series.left, last, *within(left, right, self.switches))
@@ -481,8 +485,9 @@ class CompiledSolver:
             why = f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {error}"
             raise SolverError(why) from None
         found = np.array(found, order="C")  # each state contiguous: reductions over time are then fast
-        found *= self._scale[:, None]
-        found += self._shift[:, None]
+        if self._scaled:
+            found *= self._scale[:, None]
+            found += self._shift[:, None]
         if moving.size == state.size:
             return found
         out = np.repeat(state[:, None], grid.size, axis=1)
@@ -498,9 +503,8 @@ class CompiledSolver:
         longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self.form.depends_on_time else 0.0
         allowed = min(_FEW_STEPS, self._max_steps)
         width = _terms(series).shape[1]
-        return Settings(
-            width, series.harmonics is not None, relative.tobytes(), self._kind, *self._tolerances, allowed, longest
-        )
+        what = width, series.harmonics is not None, self._scaled
+        return Settings(*what, relative.tobytes(), self._kind, *self._tolerances, allowed, longest)
 
     def _is_rare(self, settings: Settings, count: int) -> bool:
         """Whether a pattern of some output times is integrated to each of them, without an integrator of its own."""

@@ -11,7 +11,7 @@ from typing import NoReturn
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.integrate import BDF, LSODA, RK45, OdeSolver
 from scipy.linalg import block_diag
 
@@ -87,6 +87,7 @@ class Interpreted:
         self.network = network
         self.params = dict(params)
         self._probe = probe
+        self._nsignals, self._time_rows = network.nsignals, _as_slice(network.time_rows)
         self._outputs = [block.output(params) for block in network.blocks]
         self._updates = [block.update(params) for block in network.blocks]
         self._samples = {i: network.blocks[i].sampled(params) for i in network.blocks_with("period")}
@@ -109,10 +110,15 @@ class Interpreted:
     def rates_of(self, t: float, x: Array, w: Array) -> Array:
         """The same from all signals; for a discrete system the next states."""
         dx = np.zeros(x.size)
-        dx[self._linear_states] = self._a @ x[self._linear_states] + self._b @ w[self._linear_columns]
+        if self._linear_states.size:
+            dx[self._linear_states] = self._a.dot(x.take(self._linear_states)) + self._b.dot(
+                w.take(self._linear_columns)
+            )
         for i, update, place, fed in self._moving:
             try:
-                found = _row(update(t, x[place], fed(w)))
+                found = update(t, x[place], fed(w))
+                if type(found) is not np.ndarray or found.ndim != 1:
+                    found = np.ravel(found)
             except BaseException as error:
                 _locate(error, self.network.blocks[i].name, t)
                 raise
@@ -130,7 +136,8 @@ class Interpreted:
 
     def all_signals(self, times: Array, states: Array, time_values: Array) -> Array:
         """All signals (nsignals, ntime) at many times."""
-        rows = [self.signals(t, states[:, k], time_values[:, k]) for k, t in enumerate(times.tolist())]
+        x, values = np.ascontiguousarray(states.T), np.ascontiguousarray(time_values.T)
+        rows = [self.signals(t, x[k], values[k]) for k, t in enumerate(times.tolist())]
         return np.array(rows).T.reshape(-1, times.size)
 
     def sampled(self, blocks: tuple[int, ...], t: float, x: Array, time_values: Array) -> Array:
@@ -217,8 +224,8 @@ class Interpreted:
                 raise FeedthroughError(f"the direct feedthrough of block {block.name} has changed at {t:g} s")
 
     def _signals(self, steps: list[Call], t: float, x: Array, time_values: Array) -> Array:
-        w = np.zeros(self.network.nsignals)
-        w[self.network.time_rows] = time_values
+        w = np.zeros(self._nsignals)
+        w[self._time_rows] = time_values
         for step in steps:
             step(t, x, w)
         if self._doubtful and steps is self._for_all:
@@ -275,13 +282,15 @@ class Interpreted:
             d, columns = _used(np.asarray(block.system.D, dtype=float) @ network.wire[network.inputs[i]])
 
             def linear(t: float, x: Array, w: Array) -> None:
-                w[outs] = c @ x[states] + d @ w[columns]
+                w[outs] = c.dot(x[states]) + d.dot(w.take(columns))
 
             return linear
 
         def call(t: float, x: Array, w: Array) -> None:
             try:
-                found = _row(output(t, x[states], fed(w)))
+                found = output(t, x[states], fed(w))
+                if type(found) is not np.ndarray or found.ndim != 1:
+                    found = np.ravel(found)
             except BaseException as error:
                 _locate(error, block.name, t)
                 raise
@@ -302,6 +311,8 @@ class InterpretedSolver:
         self._rtol, self._atol = np.maximum(tolerances.rtol, _MIN_RTOL), tolerances.atol
         self._moving = equations.network.moving
         self._shift, self._scale = scales.shift[self._moving], scales.scale[self._moving]
+        everything = self._moving.size == scales.scale.size
+        self._plain = everything and bool(np.all(scales.scale == 1.0) and np.all(scales.shift == 0.0))
         self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
         self._segments, self._next = 0, 0
         self.switches: list[float] = []
@@ -322,10 +333,12 @@ class InterpretedSolver:
     def scaled_rates(self, t: float, z: Array, time_values: Array, start: Array) -> Array:
         """Derivatives of the scaled integrated states; the others are those at the start of the segment."""
         found = self._equations.rates(t, self.states_of(z, start), time_values)
-        return np.asarray(found[self._moving] / self._scale)
+        return found if self._plain else np.asarray(found[self._moving] / self._scale)
 
     def states_of(self, z: Array, start: Array) -> Array:
         """All states for scaled integrated states."""
+        if self._plain:
+            return z.copy()
         x = start.copy()
         x[self._moving] = self._shift + self._scale * z
         return x
@@ -467,9 +480,11 @@ def _implicit() -> Iterator[type[OdeSolver]]:
         yield BDF
 
 
-def _row(values: ArrayLike) -> Array:
-    """Values (n,) that a block returns."""
-    return values if type(values) is np.ndarray and values.ndim == 1 else np.ravel(values)
+def _as_slice(rows: NDArray[np.intp]) -> NDArray[np.intp] | slice:
+    """Slice for consecutive indices."""
+    if not rows.size or np.any(np.diff(rows) != 1):
+        return rows
+    return slice(int(rows[0]), int(rows[-1]) + 1)
 
 
 def _locate(error: BaseException, name: str, t: float) -> None:
@@ -583,6 +598,7 @@ class _Watched:
     def __init__(self, solver: InterpretedSolver, series: Series, left: float, right: float, start: Array) -> None:
         self._solver, self.series, self.left, self.right, self.start = solver, series, left, right, start
         self.defined, self._within = left, within(left, right, solver.switches)
+        self._ones = np.ones(solver.moving.size)
         self.begin(_CALLS)
 
     def begin(self, calls: int) -> None:
@@ -598,6 +614,6 @@ class _Watched:
         self._solver.review(self, t, z)
         inside = min(max(t, self._within[0]), self._within[1])
         rates = self._solver.scaled_rates(inside, z, self.series(inside), self.start)
-        if t > self.defined and math.isfinite(rates.sum()):
+        if t > self.defined and math.isfinite(rates.dot(self._ones)):
             self.defined = t
         return rates

@@ -525,7 +525,7 @@ def _product(matrix: Array) -> Callable[[Array], Array]:
 
 
 def _selected(rows: NDArray[np.intp], signals: Array) -> Array:
-    return signals[rows]
+    return signals.take(rows, axis=0)
 
 
 def _multiplied(matrix: csr_array, signals: Array) -> Array:

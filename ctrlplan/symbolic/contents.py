@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import types
 from collections import deque
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import lru_cache
 
@@ -25,8 +25,8 @@ class Slots:
     """Attributes of an object in slots of its classes."""
 
     def __init__(self, value: object) -> None:
-        kind: Hashable = type(value)
-        self.value, self.places = value, _slots_of(kind)
+        self.value = value
+        self.places = _slots_of(type(value))  # type: ignore[arg-type] # classes are hashable
 
     def values(self) -> dict[str, object]:
         """Values of the slots that are set, by name."""

@@ -17,7 +17,7 @@ import random
 import types
 from array import array
 from collections import defaultdict, deque, namedtuple
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
 from typing import Any
 
@@ -153,9 +153,9 @@ class References:
         self._tokens += ("object", number)
 
     def _visit(self, value: object, where: str) -> None:
-        kind: Hashable = type(value)
+        kind = type(value)
         self._tokens.append(Same(kind))
-        _visit_of(kind)(self, value, where)
+        _visit_of(kind)(self, value, where)  # type: ignore[arg-type] # classes are hashable
 
     def _add_named(self) -> None:
         """Add attributes with names that occur in the code found so far."""

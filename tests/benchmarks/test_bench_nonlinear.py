@@ -68,13 +68,15 @@ def solved_by_cvodes(rates, state, times, breaks, tolerance, parameter=None):
     return run
 
 
-def solved_by_python(rates, state, times, breaks, tolerance, method="LSODA"):
-    """States at the times, by solve_ivp from break to break; rates(t, x, segment) of plain numbers."""
+def solved_by_python(rates, state, times, breaks, tolerance, method="LSODA", as_list=True):
+    """States at the times, by solve_ivp from break to break; rates(t, x, segment) of plain numbers or of an array."""
     state, rows = np.asarray(state, dtype=float), [np.asarray(state, dtype=float)[:, None]]
     options = {"rtol": tolerance, "atol": 1e-2 * tolerance}
     for k, (left, right) in enumerate(pairwise([times[0], *breaks, times[-1]])):
         grid = np.union1d(times[(times > left) & (times <= right)], right)
-        found = solve_ivp(lambda t, x, k=k: rates(t, x.tolist(), k), (left, right), state, method, grid, **options)
+        found = solve_ivp(
+            lambda t, x, k=k: rates(t, x.tolist() if as_list else x, k), (left, right), state, method, grid, **options
+        )
         state = found.y[:, -1]
         rows.append(found.y[:, np.isin(grid, times)])
     return np.hstack(rows)
@@ -197,9 +199,56 @@ def test_draws_by_compiled(benchmark, capsys, crane):
     show(capsys, benchmark, "20 draws of the crane, compiled", seconds, (apart, apart))
 
 
+class CraneBlocks:
+    """Loop whose right-hand side and outputs, written by hand, call the functions of the blocks in order."""
+
+    def __init__(self, loop):
+        _, generator, trolley, hoist, crane = loop.syslist
+        self.generator, self.hoist = generator.outfcn, (hoist.updfcn, hoist.outfcn)
+        self.crane, self.matrices = (crane.updfcn, crane.outfcn), (trolley.A, trolley.B, trolley.C, trolley.D)
+        self.params = loop.params
+        self.calls = 0
+
+    def signals(self, t, s, segment):
+        """References, force, torque and the outputs of the crane."""
+        self.calls += 1
+        x, x2, z, z2 = planned(t, segment, PLAIN)
+        planned_values = np.array([x, 0.0, x2, z, 0.0, z2])  # the generator reads no first derivative
+        reference = self.generator(t, s[:0], planned_values, self.params)
+        before = self.crane[1](t, s[4:], np.zeros(2), self.params)
+        _, _, c, d = self.matrices
+        trolley, hoist = np.array([reference[0], before[2]]), np.array([reference[1], before[3]])
+        force, torque = c @ s[:2] + d @ trolley, self.hoist[1](t, s[2:4], hoist, self.params)
+        return planned_values, trolley, hoist, np.array([force[0], torque[0]])
+
+    def rates(self, t, s, segment):
+        _, trolley, hoist, inputs = self.signals(t, s, segment)
+        a, b, _, _ = self.matrices
+        parts = a @ s[:2] + b @ trolley, self.hoist[0](t, s[2:4], hoist, self.params)
+        return np.concatenate([*parts, self.crane[0](t, s[4:], inputs, self.params)])
+
+    def outputs(self, t, s, segment):
+        planned_values, _, _, inputs = self.signals(t, s, segment)
+        outputs = self.crane[1](t, s[4:], inputs, self.params)
+        return np.concatenate([outputs, inputs, planned_values[[0, 3]]])
+
+    def alone(self, states):
+        """Calls of the functions of the blocks, as many as in a run, without anything else."""
+        s, u, two = states[:, 0], np.zeros(6), np.ones(2)
+        u[3] = 1.0
+        for _ in range(self.calls):
+            self.generator(0.0, s[:0], u, self.params)
+            self.crane[1](0.0, s[4:], two, self.params)
+            self.hoist[1](0.0, s[2:4], two, self.params)
+            self.hoist[0](0.0, s[2:4], two, self.params)
+            self.crane[0](0.0, s[4:], two, self.params)
+
+
 @pytest.mark.benchmark
 def test_crane_by_python(benchmark, capsys, crane):
+    """Next to plain numbers, and to the functions of the blocks with vectors, called by hand once each in order."""
     ready, tight = crane
+    loop = CraneBlocks(cp.plants.crane_loop(CRANE, PLAN))
 
     def ours():
         return cp.simulate(ready, T, method="python")
@@ -207,11 +256,23 @@ def test_crane_by_python(benchmark, capsys, crane):
     def peer():
         return solved_by_python(crane_rates, ready.initial_state, T, [PLAN.end], 1e-10)
 
+    def by_blocks():
+        loop.calls = 0
+        states = solved_by_python(loop.rates, ready.initial_state, T, [PLAN.end], 1e-10, as_list=False)
+        places = zip(T.tolist(), states.T, (PLAN.end <= T).tolist(), strict=True)
+        return states, np.array([loop.outputs(*place) for place in places]).T
+
     benchmark.pedantic(ours, rounds=1, warmup_rounds=1)
     seconds, (found, theirs) = interleaved(ours, peer, 3)
     errors = worst(found.states, tight), worst(theirs, tight)
     assert max(errors) <= 1e-7
     show(capsys, benchmark, "crane, python, 3001 samples", seconds, errors)
+    seconds, (found, (states, outputs)) = interleaved(ours, by_blocks, 3)
+    assert worst(found.outputs, outputs) <= 1e-6
+    show(capsys, benchmark, "  next to the same functions by hand", seconds, (errors[0], worst(states, tight)))
+    parts, _ = interleaved(lambda: loop.alone(states), peer, 3)
+    with capsys.disabled():
+        print(f"  the functions alone: {1e3 * parts[0]:.1f} ms, {parts[0] / parts[1]:.2f} of plain numbers")
 
 
 # A saturated loop and an aircraft that takes off and lands vertically
