@@ -1,10 +1,12 @@
 """Integrals of a tracking error."""
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.metrics._pieces import NOWHERE, Pieces, joined, pieces, squares
+from ctrlplan.metrics._pieces import LONG, NOWHERE, Pieces, Smooth, gathered, pieces, squares
 from ctrlplan.metrics._records import QUIET, Array, Value, diverged, instant, plain, signal, times
+
+_MANY = 0.1  # share of the intervals above which all cubics of a signal are computed
 
 
 def iae(timepts: ArrayLike, error: ArrayLike) -> Value:
@@ -137,21 +139,35 @@ def squared(t: Array, f: Array) -> Value:
 def _absolute(t: Array, f: Array, since: float | None = None) -> Value:
     """Return the integrals of abs(f), shape (...), weighted by the time after `since` if given."""
     rows = f.reshape(-1, t.size)
-    values, near, others = np.full(len(rows), np.inf), [NOWHERE], list[Pieces]()
-    begin = -np.inf if since is None else since
+    values, left = np.full(len(rows), np.inf), list[NDArray[np.intp]]()
+    begin = None if since is None else t[:-1] - since
+    smooth = Smooth(t) if t.size >= LONG else None
     with np.errstate(**QUIET):
         for i, row in enumerate(rows):
-            if diverged(row):
-                continue
-            p = pieces(t, row)
-            direct = p.keeps_sign & (p.begin >= begin)
-            areas = p.mean if since is None else (p.begin - since) * p.mean + p.step * p.moment
-            values[i] = np.sum((p.step * np.abs(areas))[direct])
-            others.append(p[~direct])
-            near.append(np.full(others[-1].a.size, i))
-        if others:
-            np.add.at(values, np.concatenate(near), _areas(joined(others), since))
+            others = NOWHERE
+            if not diverged(row):
+                values[i], others = _known_areas(t, row, begin) if smooth is None else _smooth_areas(smooth, row, begin)
+            if others.size > _MANY * t.size:  # whole signals are then faster than windows about the intervals
+                values[i] += np.sum(_areas(pieces(t, row)[others], since))
+                others = NOWHERE
+            left.append(others)
+        chosen, of = gathered(left)
+        np.add.at(values, of, _areas(pieces(t, rows, chosen, of), since))
     return plain(values, f.shape[:-1])
+
+
+def _known_areas(t: Array, f: Array, begin: Array | None) -> tuple[float, NDArray[np.intp]]:
+    """Return the integral over the intervals in which a signal is known to be of one sign, and the other intervals."""
+    p = pieces(t, f)
+    direct = p.keeps_sign if begin is None else p.keeps_sign & (begin >= 0)
+    areas = p.mean if begin is None else begin * p.mean + p.step * p.moment
+    return float(np.sum((p.step * np.abs(areas))[direct])), np.flatnonzero(~direct)
+
+
+def _smooth_areas(smooth: Smooth, f: Array, begin: Array | None) -> tuple[float, NDArray[np.intp]]:
+    """Return the same for a long signal, with sign and smooth curvature known."""
+    areas, known = smooth.areas(f, begin)
+    return float(np.abs(areas) @ known), np.concatenate([[0], np.flatnonzero(~known) + 1, [f.size - 2]])
 
 
 def _areas(p: Pieces, since: float | None) -> Array:

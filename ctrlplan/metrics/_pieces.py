@@ -16,7 +16,7 @@ there, with dynamics that samples as far apart as its time constants do not show
 from the extrapolated curvature alone, is therefore no overshoot of a response.
 """
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ _ASIDE = 0.25  # of the larger curvature: a smaller one of opposite sign is the 
 _JUMP = 2.0  # multiple of both neighbouring slopes above which there is a jump
 _UNEVEN = 4.0  # ratio of adjacent intervals up to which few digits are lost in products of samples
 _BLOCK = 2**15  # samples
-_LONG = 2**9  # samples, from which on one row costs more than the calls for it
+LONG = 2**9  # samples, from which on one row costs more than the calls for it
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
@@ -192,12 +192,6 @@ def _mean_square(a: Array, end: Array, c: Array, d: Array) -> Array:
     return np.asarray(sum(weight * term * term for weight, term in _legendre(a, end, c, d)))
 
 
-def joined(parts: Sequence[Pieces]) -> Pieces:
-    """Return the pieces of several signals as one."""
-    names = Pieces.__dataclass_fields__
-    return Pieces(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
 @contextmanager
 def shared() -> Iterator[None]:
     """Compute the cubics of a signal once for all metrics of a block."""
@@ -267,7 +261,7 @@ class Bulges:
 
 def blocks(f: Array) -> Iterator[slice]:
     """Yield rows (nrows, ntime) in blocks that fit into the cache; long rows one by one, whose cubics may be shared."""
-    count = max(1, _BLOCK // f.shape[1]) if f.shape[1] < _LONG else 1
+    count = max(1, _BLOCK // f.shape[1]) if f.shape[1] < LONG else 1
     return (slice(begin, begin + count) for begin in range(0, len(f), count))
 
 
@@ -302,7 +296,7 @@ def _largest(t: Array, f: Array, size: Callable[[Array], Array], extrapolated: b
 
 def squares(t: Array, f: Array) -> Array:
     """Return the integrals over time of the squares of several signals (nrows, ntime)."""
-    if f.shape[1] < _LONG or not _is_even(t):
+    if f.shape[1] < LONG or not _is_even(t):
         return np.concatenate([_cubics(t, f[some]).square() for some in blocks(f)] or [np.empty(0)])
     found = _FORMS.get(t.tobytes(), lambda: _SquareForm(t))(f)
     for i in np.flatnonzero(~np.isfinite(found)):  # terms may overflow where the squares of the signal do not
@@ -316,21 +310,60 @@ def _is_even(t: Array) -> bool:
     return bool(np.all(np.maximum(step[1:], step[:-1]) <= _UNEVEN * np.minimum(step[1:], step[:-1])))
 
 
-class _SquareForm:
+class Smooth:
+    """Cubics of signals on inner intervals with smooth curvature, where they are linear in four samples."""
+
+    def __init__(self, t: Array) -> None:
+        self.step, self.width, self.span = np.diff(t), t[2:] - t[:-2], t[3:] - t[:-3]
+
+    def differences(self, f: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """Return slopes, curvatures and third differences, and which of these are smooth.
+
+        Shapes (ntime - 1,), (ntime - 2,) and twice (ntime - 3,).
+        """
+        slope = np.diff(f)
+        slope /= self.step
+        d = np.diff(slope)
+        d /= self.width
+        third, size = np.diff(d), np.abs(d)
+        smooth = np.abs(third) <= _CURVATURES * np.minimum(size[:-1], size[1:])
+        third /= self.span
+        return slope, d, third, smooth
+
+    def areas(self, f: Array, begin: Array | None) -> tuple[Array, NDArray[np.bool_]]:
+        """Return integrals over inner intervals of known sign, and which these are, shapes (ntime - 3,).
+
+        With `begin`, the starts of all intervals relative to a time, the signal is weighted by the time after it.
+        """
+        _, d, third, smooth = self.differences(f)
+        size, step, a, end = np.abs(f), self.step[1:-1], f[1:-2], f[2:-1]
+        square = step * step
+        bulge = np.maximum(np.abs(d[:-1]), np.abs(d[1:])) * square
+        known = smooth & (a * end >= 0) & (bulge <= 4 * np.minimum(size[1:-2], size[2:-1]))
+        bow, twist = _bent(d[:-1], third, self.step[:-2], step)
+        bow += twist
+        mean = (a + end) / 2 - bow / 6 - twist / 12
+        if begin is not None:
+            known &= begin[1:-1] >= 0
+            mean = begin[1:-1] * mean + step * (a / 6 + end / 3 - bow / 12 - twist / 20)
+        return step * mean, known
+
+
+class _SquareForm(Smooth):
     """Integral of the square of a signal as a quadratic form of its samples.
 
-    Where the curvature is smooth, a cubic is linear in its four samples: the form has four bands. Other intervals are
-    corrected.
+    Where the curvature is smooth, the form has four bands. Other intervals are corrected.
     """
 
     def __init__(self, t: Array) -> None:
-        self._t, self._step, self._width, self._span = t, np.diff(t), t[2:] - t[:-2], t[3:] - t[:-3]
-        early, step, late = self._step[:-2], self._step[1:-1], self._step[2:]
+        super().__init__(t)
+        self._t = t
+        early, step, late = self.step[:-2], self.step[1:-1], self.step[2:]
         none, one = np.zeros_like(step), np.ones_like(step)
         # Factors of the samples k - 1 to k + 2, shape (4, m), for the interval from k to k + 1.
-        left = np.array([1 / early, -1 / early - 1 / step, 1 / step, none]) / self._width[:-1]
-        right = np.array([none, 1 / step, -1 / step - 1 / late, 1 / late]) / self._width[1:]
-        third = (right - left) / self._span
+        left = np.array([1 / early, -1 / early - 1 / step, 1 / step, none]) / self.width[:-1]
+        right = np.array([none, 1 / step, -1 / step - 1 / late, 1 / late]) / self.width[1:]
+        third = (right - left) / self.span
         ends = np.array([none, one, none, none]), np.array([none, none, one, none])
         terms = _legendre(*ends, *_bent(left, third, early, step))
         self._bands = [np.zeros(t.size - j) for j in range(4)]
@@ -341,18 +374,13 @@ class _SquareForm:
 
     def __call__(self, f: Array) -> Array:
         """Return the integrals of signals (nrows, ntime), shape (nrows,)."""
-        found, rough, near = np.empty(len(f)), list[NDArray[np.intp]](), list[tuple[Array, ...]]()
+        found, rough, near = np.empty(len(f)), list[NDArray[np.intp]](), list[tuple[NDArray[np.generic], ...]]()
         for i, row in enumerate(f):
             found[i] = sum(band @ (row[: band.size] * row[row.size - band.size :]) for band in self._bands)
-            slope = np.diff(row)
-            slope /= self._step
-            d = np.diff(slope)
-            d /= self._width
-            change, size = np.diff(d), np.abs(d)
-            k = np.flatnonzero(~(np.abs(change) <= _CURVATURES * np.minimum(size[:-1], size[1:])))
-            change /= self._span
+            slope, d, third, smooth = self.differences(row)
+            k = np.flatnonzero(~smooth)
             steep = np.abs(slope[k + 1]) > _JUMP * np.maximum(np.abs(slope[k]), np.abs(slope[k + 2]))
-            near.append((change[k], *_neighbours(change, (k,)), d[k], d[k + 1], row[k + 1], row[k + 2], steep))
+            near.append((third[k], *_neighbours(third, (k,)), d[k], d[k + 1], row[k + 1], row[k + 2], steep))
             rough.append(k)
         every, rows = gathered(rough)
         np.add.at(found, rows, self._corrections(every, *map(np.concatenate, zip(*near, strict=True))))
@@ -373,8 +401,8 @@ class _SquareForm:
         steep: Array,
     ) -> Array:
         """Return what the cubics of inner intervals k + 1 without smooth curvature add to the form."""
-        base, cut, broken, _ = _sided(c, before, after, one, other, self._span[k])
-        early, step = self._step[k], self._step[k + 1]
+        base, cut, broken, _ = _sided(c, before, after, one, other, self.span[k])
+        early, step = self.step[k], self.step[k + 1]
         squares = _mean_square(a, end, *_bent(base, cut, early, step))
         squares = np.where(broken & (steep > 0), (a**2 + end**2) / 2, squares)
         return step * (squares - _mean_square(a, end, *_bent(one, c, early, step)))
@@ -385,8 +413,9 @@ _FORMS: Lru[bytes, _SquareForm] = Lru(4)
 
 def _bent(base: Array, third: Array, early: Array, step: Array) -> tuple[Array, Array]:
     """Return c and d of cubics from their brackets at the start of the interval before, as in `_shapes`."""
-    d = third * step**3
-    return (base + early * third) * step**2 - d, d
+    square = step * step
+    d = third * (square * step)
+    return (base + early * third) * square - d, d
 
 
 def gathered(chosen: list[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -15,10 +15,10 @@ from ctrlplan.studies.outcomes import Failed, tried
 
 T = TypeVar("T")
 
-_RUNS = 16
+_RUNS = 32
 """Maximum number of runs whose metrics are computed together."""
 
-_SAMPLES = 2**17
+_SAMPLES = 2**18
 """Maximum number of samples of a signal over these runs."""
 
 

@@ -492,42 +492,43 @@ def signal_metrics(
     -------
     dict of str to ndarray, shape (nloops,)
     """
-    if len(record.y) > _TOGETHER:
-        parts = [slice(k, k + _TOGETHER) for k in range(0, len(record.y), _TOGETHER)]
-        results = [
-            signal_metrics(
-                replace(record, y=record.y[part], u=record.u[part], unstable=record.unstable[part]),
-                plan,
-                start,
-                band,
-                measures,
-            )
-            for part in parts
-        ]
-        return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
     known = slice(int(np.searchsorted(record.t, start)), None)  # no copy of the rows
-    t, y, u = record.t[known], record.y[..., known], record.u[..., known]
-    kinds: list[tuple[Kind, Sequence[Tracked | Acting], tuple[str, ...]]] = [
-        ("response", _tracked(t, y, plan, band, start), record.axes),
-        ("control", [Acting(t, rows, start) for rows in _rows(u)], record.controls),
-    ]
+    t, course = record.t[known], _Course.of(plan, record.t[known])
+    parts, count = [], max(1, _TOGETHER // record.t.size)
+    for first in range(0, len(record.y), count):
+        some = slice(first, first + count)
+        y, u = record.y[some, :, known], record.u[some, :, known]
+        kinds: list[tuple[Kind, Sequence[Tracked | Acting], tuple[str, ...]]] = [
+            ("response", _tracked(t, y, course, band, start), record.axes),
+            ("control", [Acting(t, rows, start) for rows in _rows(u)], record.controls),
+        ]
+        parts.append(_values(kinds, measures, record.unstable[some]))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
+
+
+def _values(
+    kinds: list[tuple[Kind, Sequence[Tracked | Acting], tuple[str, ...]]],
+    measures: Mapping[str, Measure],
+    unstable: NDArray[np.bool_],
+) -> dict[str, Array]:
+    """Metrics of the signals of each kind, by label, of loops that are unstable or not."""
     found: dict[str, Array] = {}
     for kind, seen, labels in kinds:
         tables = {}
         with shared():  # measures share the cubics of a signal
             for name, function in _functions(kind, measures) if labels else ():
-                tables[name] = _table(function, seen, len(y))
+                tables[name] = _table(function, seen, len(unstable))
         for name in tables:
             if name in SETTLING_TIMES:
-                tables[name][record.unstable] = np.inf
+                tables[name][unstable] = np.inf
         found |= {name: np.fmax.reduce(table, axis=1) for name, table in tables.items()}
         for name, table in tables.items() if len(labels) > 1 else ():
             found |= {f"{name}_{label}": row for label, row in zip(labels, table.T, strict=True)}
     return found
 
 
-_TOGETHER = 16
-"""Number of loops whose metrics are computed together; more would need more memory than they gain time."""
+_TOGETHER = 2**18
+"""Maximum number of samples of a signal over the loops whose metrics are computed together, for their memory."""
 
 SETTLING_TIMES = ("settling_time", "tracking_settling_time")
 """Metrics that are infinite for an unstable loop, and discontinuous along a parameter."""
@@ -538,14 +539,29 @@ def _rows(signals: Array) -> list[Array]:
     return [signals[0]] if len(signals) == 1 else list(signals.swapaxes(0, 1))
 
 
-def _tracked(t: Array, y: Array, plan: Trajectory, band: float, start: float) -> list[Tracked]:
+@dataclass(frozen=True)
+class _Course:
+    """Positions of a plan at sample times, and its ends and range, (naxes, ...)."""
+
+    reference: Array
+    initial: Array
+    final: Array
+    span: Array
+
+    @classmethod
+    def of(cls, plan: Trajectory, t: Array) -> _Course:
+        extrema = plan.extrema()
+        span = np.maximum(extrema.maximum - extrema.minimum, np.abs(plan.final - plan.initial))
+        return cls(plan.jet(t, 0)[0], plan.initial, plan.final, span)
+
+
+def _tracked(t: Array, y: Array, course: _Course, band: float, start: float) -> list[Tracked]:
     """Arguments of measures of responses, for each of `_rows`."""
-    reference, extrema = plan.jet(t, 0)[0], plan.extrema()
-    span = np.maximum(extrema.maximum - extrema.minimum, np.abs(plan.final - plan.initial))
     found = []
     for k, rows in enumerate(_rows(y)):
         own = slice(None) if len(y) == 1 else slice(k, k + 1)
-        found.append(Tracked(t, rows, reference[own], plan.initial[own], plan.final[own], span[own], band, start))
+        of_plan = (course.reference[own], course.initial[own], course.final[own], course.span[own])
+        found.append(Tracked(t, rows, *of_plan, band, start))
     return found
 
 
