@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, NoReturn, get_args
 
 import numpy as np
@@ -21,7 +22,7 @@ from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
 from ctrlplan.planning.path_law import FastLaw, Rates, fastest_law, fastest_smooth_law
 from ctrlplan.planning.path_law.positions import required_rate
-from ctrlplan.planning.path_law.signals import HIGHEST, fast_law_of_signals, law_with_given_ends
+from ctrlplan.planning.path_law.signals import HIGHEST, fast_laws_of_signals, law_with_given_ends
 from ctrlplan.planning.path_law.vehicle import fastest_segment_law, orders_on_path
 from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, bottom, scan
@@ -81,6 +82,12 @@ _AT_ENDS = 1e-12
 
 _EVALUATIONS, _ACTIVE = 6, 1e-9
 """Number of evaluations of a plan near its limits, and margin of the active limit that ends them."""
+
+_SLOWED = 1.002
+"""Maximum duration with which a law is slowed until it satisfies the limits, relative to its own."""
+
+_NEARBY = 1e-7 * 4.0 ** np.arange(11)
+"""Distances of factors from 1 at which an excess over a limit is evaluated."""
 
 _LOCAL = "not searched; a local minimum of the time law"
 
@@ -420,10 +427,13 @@ def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, f
         _check_rest(plan, limited)
         _check_signs(plan, limited, given=False)
         _closed_form(plan, limited, 1)  # raises for a direction in which no velocity is allowed
-        law = fast_law_of_signals(plan.shift(-start), limited, start)
-        found = None if law is None or span is not None else _at_its_limit(law.shift(start), limited)
-        if found is not None:
-            return found
+        for other in fast_laws_of_signals(plan.shift(-start), limited, start):
+            found = _at_its_limit(other.shift(start), limited) if span is None else None
+            if found is not None:
+                return found
+            law = other if law is None else law
+            if span is not None:
+                break
         if any(_is_signed(bound) for bound in limited.bounds):
             raise ValueError(
                 "limits that forbid a sign must be satisfied by a time law on the path, got none that is found; give a "
@@ -505,7 +515,10 @@ def _fastest_between_stops(plan: PathPlan, limited: Limited, span: tuple[float, 
             laws.append(fastest_segment_law(part, own, orders))
         else:
             seen = own.seen(part)
-            fast_part = fast_law_of_signals(seen, own, 0.0) if own.order <= HIGHEST else with_fast_time_law(seen, own)
+            if own.order <= HIGHEST:
+                fast_part = next(fast_laws_of_signals(seen, own, 0.0), None)
+            else:
+                fast_part = with_fast_time_law(seen, own)
             laws.append(part.laws[0] if fast_part is None else Retimed(part.laws[0], fast_part.law))
     fast = plan.with_laws(laws).shift(plan.start - laws[0].start)
     if orders is None:
@@ -709,13 +722,17 @@ def _is_over_time(bound: Bound) -> bool:
 def _at_its_limit(plan: Trajectory, limited: Limited) -> Fastest | None:
     """Plan of fixed shape near a duration at which its active limit is attained; None if not found in a few steps.
 
-    The duration is that at which the signal at the time of its extremum attains the limit.
+    The duration is that at which the signal at the time of its extremum attains the
+    limit. If there is none nearby, the shortest plan found that satisfies the limits.
     """
+    best, longest = None, _SLOWED * plan.duration
     for _ in range(_EVALUATIONS):
         margins = limited.margins(plan)
         active = margins.active
+        if active.fraction >= 0.0 and (best is None or plan.duration < best.duration):
+            best = Fastest(plan, margins, ((plan.duration, plan.duration),), "path", limited, statement=_LOCAL)
         if 0.0 <= active.fraction <= _ACTIVE:
-            return Fastest(plan, margins, ((plan.duration, plan.duration),), "path", limited, statement=_LOCAL)
+            break
         row = next(k for k, bound in enumerate(limited.bounds) if active.of(bound))
         jet = np.stack([plan.jet(active.time, limited.order, left=left) for left in (True, False)], axis=-1)
         powers = -np.arange(float(len(jet)))[:, None, None]
@@ -723,11 +740,26 @@ def _at_its_limit(plan: Trajectory, limited: Limited) -> Fastest | None:
         def excess(factor: float, jet: Array = jet, powers: Array = powers, row: int = row) -> float:
             return float(limited.bounds[row].excess(limited.values(jet * factor**powers)[row]).max())
 
-        try:
-            factor = float(brentq(excess, 0.97, 1.1, xtol=1e-15))
-        except ValueError:  # the signal has no such duration nearby, or is infeasible for the plant
-            return None
+        factor = _nearest_root(excess)
+        if factor is None or factor * plan.duration > longest:
+            break
         plan = plan.retime(plan.duration * factor * (1.0 + 0.1 * _ACTIVE))
+    return best
+
+
+def _nearest_root(excess: Callable[[float], float]) -> float | None:
+    """Factor of a duration near 1 at which an excess vanishes, above 1 if it is violated there; None if none is near.
+
+    The excess of a signal that depends on differences of large terms is no monotone function of the duration.
+    """
+    try:
+        beyond = excess(1.0) > 0.0
+        factors = 1.0 + (1.0 if beyond else -1.0) * np.append(0.0, _NEARBY)
+        for near, far in pairwise(factors.tolist()):
+            if (excess(far) > 0.0) != beyond:
+                return float(brentq(excess, near, far, xtol=1e-15))
+    except ValueError:  # infeasible for the plant
+        pass
     return None
 
 

@@ -91,6 +91,16 @@ class Grid:
         bends[last] = [bend for part in self.parts for bend in part.bends]
         return ratios, bends
 
+    @cached_property
+    def rests(self) -> NDArray[np.bool_]:
+        """Whether cells begin and end (2, ncells) at points of rest."""
+        found = np.zeros((2, self.length.size), dtype=bool)
+        first = np.flatnonzero(np.diff(self.part, prepend=-1))
+        last = np.append(first[1:], self.part.size) - 1
+        found[0, first] = [part.spans[0].rests[0] > 0.0 for part in self.parts]
+        found[1, last] = [part.spans[-1].rests[1] > 0.0 for part in self.parts]
+        return found
+
     @property
     def prescribed(self) -> Array:
         """Prescribed squared rates of all open parts, at the start and at the end of each."""

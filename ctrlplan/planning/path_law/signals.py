@@ -10,8 +10,9 @@ points of all cells.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,11 @@ from scipy.optimize import brentq
 from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.interior_point import minimum
-from ctrlplan.planning.path_law.jerk import smooth_law
+from ctrlplan.planning.path_law.jerk import on_pieces, smooth_law
 from ctrlplan.planning.path_law.law import problem_of
 from ctrlplan.planning.path_law.rows import Rows
-from ctrlplan.planning.path_law.spans import Rates, parts_of
-from ctrlplan.trajectories import Retimed, Trajectory
+from ctrlplan.planning.path_law.spans import Part, Rates, parts_of
+from ctrlplan.trajectories import PiecewisePolynomial, Retimed, Trajectory
 from ctrlplan.trajectories.common import FACTORIALS, Array
 from ctrlplan.trajectories.retimed import composed
 
@@ -37,8 +38,17 @@ _POINTS: Array = np.asarray(0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 10)), dty
 _ROUNDS, _GAIN = 30, 5e-4
 """Maximum number of problems, and the decrease of the duration, relative to it, that ends them."""
 
-_NEAR, _WORSE = 0.5, 0.05
-"""Solutions are linearised about that need to be slowed down in b, or in their duration, by no more than that."""
+_LOSS, _REFINEMENTS, _PIECES = 5e-3, 3, 3
+"""As for limits of the acceleration; signals are at no limit while a derivative of the rate changes."""
+
+_FINER = 1e-3
+"""Decrease of the duration by finer cells, relative to it, below which they are not divided any more."""
+
+_TRUST, _WIDEST = 2.0, 4.0
+"""Trust region of the first problem, and largest one."""
+
+_NEAR, _WORSE = 1.5, 0.05
+"""Solutions are linearised about with no larger penalty, and with no larger increase of the duration."""
 
 _FARTHEST = 1e4
 """Largest trust region, in which a first solution is found for a plan that violates the limits."""
@@ -55,20 +65,26 @@ _STEP = 1e-6
 _RESERVE = 1e-4
 """Distance from limits, relative to their scale, for points between those of the cells."""
 
-_TIGHTENINGS, _BETWEEN = 6, 3e-4
-"""Maximum number of times by which limits are tightened in cells that violate them by so much between the points."""
+_TIGHTENINGS = 6
+"""Maximum number of times by which limits are tightened in cells that violate them between the points."""
+
+_ALLOWED = (3e-4, -1e-4, -1e-3)
+"""Violations between the points of laws, one after the other until one satisfies the limits or is slowed to do so."""
 
 _INFEASIBLE = 0.05
 """Violation attributed to a plan that is infeasible for the plant between the points."""
 
-_CHECKS: Array = np.asarray((np.arange(24) + 0.5) / 24.0, dtype=float)
-"""Points at which that is evaluated."""
+_CHECKS: Array = np.linspace(0.0, 1.0, 25)
+"""Points of a cell, in time, at which that is evaluated."""
 
 _SLOWEST = 1e-12
 """Smallest multiple of a squared rate that is tried, and reciprocal of the largest one."""
 
 _PENALTY = 10.0
-"""Increase of a duration relative to the maximum violation, where a law cannot be slowed down."""
+"""Penalty of a duration, relative to it, per violation relative to the scale of a limit."""
+
+_TINY = 1e-300
+"""Smallest squared rate."""
 
 _SCALE, _BEYOND = 1e-4, 10.0
 """Resolution of multiples of b, and the violation attributed to one that is infeasible for the plant."""
@@ -80,8 +96,8 @@ HIGHEST = 5
 """Highest derivative of the plan on which signals may depend: the law has four continuous ones, the fifth jumps."""
 
 
-def fast_law_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Retimed | None:
-    """Plan with a fast time law; limits may be slightly violated between points of the cells.
+def fast_laws_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Iterator[Retimed]:
+    """Plans with fast time laws, at larger and larger distances from the limits, which may be slightly violated.
 
     Parameters
     ----------
@@ -92,42 +108,57 @@ def fast_law_of_signals(plan: Trajectory, limited: Limited, origin: float) -> Re
     origin : float
         Start [s] of the plan before it was moved to 0.
 
-    Returns
-    -------
-    Retimed, or None
-        None if no multiple of the plan's rate satisfies the limits, or every one, or if
+    Yields
+    ------
+    Retimed
+        Nothing if no multiple of the plan's rate satisfies the limits, or every one, or if
         no other rate makes it shorter.
     """
-    problems = _Problems(plan, limited, origin, (None, None))
+    problems = _Problems.of(plan, limited, origin, (None, None))
     scale = problems.feasible_scale()
     if not 0.0 < scale < 1.0 / _SLOWEST:
-        return None
-    law = problems.law(_START * scale, _RESERVE, 0.0 if problems.signed else _BETWEEN)
-    faster = law.duration < (1.0 - _RESERVE) * plan.duration / scale**0.5
-    return Retimed(plan, law) if faster or problems.signed else None
+        return
+    allowed = (0.0,) if problems.signed else _ALLOWED
+    for law in problems.laws(_START * scale, _RESERVE, allowed):
+        if law.duration < (1.0 - _RESERVE) * plan.duration / scale**0.5 or problems.signed:
+            yield Retimed(plan, law)
 
 
 def law_with_given_ends(plan: Trajectory, limited: Limited, origin: float, reserve: float) -> Trajectory:
-    """Plan with a fast time law and its own speeds at the ends; limits may be violated if none is found.
+    """Plan with a fast time law and its own speeds at the ends; the plan itself if none is found.
 
     Parameters
     ----------
     plan, limited, origin
-        As for `fast_law_of_signals`.
+        As for `fast_laws_of_signals`.
     reserve : float
         Distance from the limits at points of the cells, relative to their scale.
     """
-    return Retimed(plan, _Problems(plan, limited, origin, (1.0, 1.0)).law(1.0, reserve, 0.0))
+    problems = _Problems.of(plan, limited, origin, (1.0, 1.0))
+    law = next(problems.laws(1.0, reserve, (0.0,)), None)
+    return plan if law is None else Retimed(plan, law)
+
+
+class _Solution(NamedTuple):
+    """Coefficients of a law, and its duration [s] with a penalty of violations of the limits."""
+
+    x: Array
+    duration: float
 
 
 class _Problems:
     """Linearised problems for the time law of a plan, with squared rates at its ends that may be given."""
 
-    def __init__(self, plan: Trajectory, limited: Limited, origin: float, given: Rates) -> None:
-        self._parts = parts_of(plan, True, (), given, origin)
-        self._grid = Grid.of(plan, [part for part in self._parts if part.moves])
-        self._spline = Spline.quartic(self._grid)
-        self._signals, self._between = (_Signals(self._grid, limited, points) for points in (_POINTS, _CHECKS))
+    def __init__(self, parts: Sequence[Part], grid: Grid, limited: Limited) -> None:
+        self._parts, self._grid, self._limited = parts, grid, limited
+        self._spline = Spline.quartic(grid)
+        self._signals, self._between = (_Signals(grid, limited, points) for points in (_POINTS, _CHECKS))
+
+    @classmethod
+    def of(cls, plan: Trajectory, limited: Limited, origin: float, given: Rates) -> _Problems:
+        """Problems on the initial cells of a plan."""
+        parts = parts_of(plan, True, (), given, origin)
+        return cls(parts, Grid.of(plan, [part for part in parts if part.moves]), limited)
 
     @property
     def signed(self) -> bool:
@@ -138,8 +169,8 @@ class _Problems:
         """Largest squared rate, the same along the plan, that satisfies the limits at the points."""
         return self._signals.feasible_scale(np.ones((5, self._grid.length.size)), 1.0 / _SLOWEST)
 
-    def law(self, rate: float, reserve: float, between: float) -> Trajectory:
-        """Time law near a local minimum.
+    def laws(self, rate: float, reserve: float, allowed: Sequence[float]) -> Iterator[PiecewisePolynomial]:
+        """Time laws near a local minimum, the finest first.
 
         Parameters
         ----------
@@ -147,55 +178,98 @@ class _Problems:
             Squared rate of the start.
         reserve : float
             Distance from the limits at the points.
-        between : float
-            Violation between them below which limits are not tightened.
+        allowed : sequence of float
+            Violations between the points with which laws are returned, decreasing;
+            distances from the limits are negative.
         """
         x = np.where(self._spline.fixed, 1.0, rate)
         x[self._spline.fixed] = self._grid.prescribed
-        reserves = np.full(self._grid.length.size, reserve)
-        for _ in range(_TIGHTENINGS + 1):
-            x = self._converged(x, reserves)
-            excess = self._between.excess(self._spline.coefficients(x))
-            if excess.max() <= between:
-                break
-            reserves += 1.5 * np.maximum(excess, 0.0)
+        for problems, found in reversed(list(self._refined(x, reserve))):
+            yield from problems._tightened(found, reserve, allowed)
+
+    def _refined(self, x: Array, reserve: float) -> Iterator[tuple[_Problems, Array]]:
+        """Local minima on finer and finer cells, with their problems."""
+        problems, found, former = self, self._converged(x, self._reserves(reserve)), math.inf
+        yield self, found.x
+        for _ in range(_REFINEMENTS):
+            local = problems._spline.coefficients(found.x)
+            loss = problems._signals.losses(local)
+            if loss.sum() < _LOSS or found.duration > (1.0 - _FINER) * former:
+                return
+            counts = np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int)
+            counts[problems._grid.rests.any(axis=0)] = 1  # there derivatives of the law multiply rounding of the plan
+            problems, former = _Problems(self._parts, problems._grid.divided(counts), self._limited), found.duration
+            found = problems._converged(problems._near(on_pieces(local, counts)), problems._reserves(reserve))
+            if found.duration > (1.0 + _WORSE) * former:  # not found again
+                return
+            yield problems, found.x
+
+    def _reserves(self, reserve: float) -> Array:
+        """The same distance from the limits in every cell."""
+        return np.full(self._grid.length.size, reserve)
+
+    def _near(self, local: Array) -> Array:
+        """Coefficients of given Bernstein coefficients."""
+        x = self._spline.near(local)
+        x[self._spline.fixed] = self._grid.prescribed
+        return x
+
+    def _tightened(self, x: Array, reserve: float, allowed: Sequence[float]) -> Iterator[PiecewisePolynomial]:
+        """Time laws near coefficients that satisfy the limits between the points as well, up to allowed violations."""
+        reserves = self._reserves(reserve)
+        for most in allowed:
+            for _ in range(_TIGHTENINGS):
+                law = self._time_law(x)
+                excess = self._excess(law)
+                if excess.max() <= most:
+                    yield law
+                    break
+                reserves += 1.5 * np.maximum(excess - min(most, 0.0), 0.0)
+                x, duration = self._converged(x, reserves)
+                if not math.isfinite(duration):
+                    return
+
+    def _time_law(self, x: Array) -> PiecewisePolynomial:
         return smooth_law(self._grid.plan, self._parts, self._grid, self._spline.coefficients(x))
 
-    def _converged(self, x: Array, reserves: Array) -> Array:
-        """Coefficients near a local minimum, with a distance (ncells,) from the limits in each cell."""
-        best, duration, trust = x, np.inf, 2.0
+    def _excess(self, law: PiecewisePolynomial) -> Array:
+        """Maximum violation in each cell (ncells,) of a law, in the scale of the limits."""
+        edges = np.searchsorted(law(law.breakpoints), self._grid.times(np.array([0.5]))[0]) - 1
+        starts, durations = law.breakpoints[edges, None], np.diff(law.breakpoints)[edges, None]
+        times = (starts + durations * _CHECKS).ravel()
+        return self._between.excess(Retimed(self._grid.plan, law).jet(times, self._limited.order))
+
+    def _converged(self, x: Array, reserves: Array) -> _Solution:
+        """Local minimum near coefficients, with a distance (ncells,) from the limits in each cell.
+
+        Solutions are compared by their durations with a penalty of violations of the limits.
+        """
+        best, duration, trust, solved = x, math.inf, _TRUST, False
         for _ in range(_ROUNDS):
             try:
                 rows = self._signals.rows(self._spline.coefficients(x), reserves)
                 problem = replace(problem_of(self._grid, self._spline, rows), trust=trust)
                 tried = minimum(problem, x)
             except ValueError:  # the linearised limits cannot be satisfied near this solution
-                x, trust = best, trust**0.4 if math.isfinite(duration) else 4.0 * trust
+                x, trust = best, trust**0.4 if solved else 4.0 * trust
                 if not 1.001 < trust < _FARTHEST:
                     break
                 continue
-            scale, feasible = self._slowed(tried)
-            promised = 1.0 - problem.duration(tried) / duration
-            gain = 1.0 - problem.duration(tried) / scale**0.5 / duration
+            beyond, own, solved = self._signals.beyond(self._spline.coefficients(tried)), problem.duration(tried), True
+            if beyond >= _BEYOND and not math.isfinite(duration):  # infeasible for the plant
+                trust **= 0.5
+                continue
+            penalty = 1.0 + _PENALTY * max(beyond, 0.0)
+            promised, gain = 1.0 - own / duration, 1.0 - own * penalty / duration
             if gain > 0.0:
-                best, duration = feasible, problem.duration(tried) / scale**0.5
-            if (scale > 1.0 - _GAIN and abs(gain) < _GAIN and trust > _SETTLED) or trust < 1.001:
+                best, duration = tried, own * penalty
+            if (penalty < 1.0 + _GAIN and abs(gain) < _GAIN and trust > _SETTLED) or trust < 1.001:
                 break
-            x = tried if scale > _NEAR and gain > -_WORSE else best
-            trust = min(2.0 * trust, 4.0) if gain > 0.75 * promised else trust if gain > 0.25 * promised else trust**0.5
-        return best
-
-    def _slowed(self, x: Array) -> tuple[float, Array]:
-        """Factor of a squared rate with which it satisfies the limits, and the product.
-
-        With given rates at the ends, and with limits that forbid a sign, there is no such
-        factor; that of the duration is a penalty.
-        """
-        local = self._spline.coefficients(x)
-        if self._spline.fixed.any() or self._signals.strict.any():
-            return (1.0 + _PENALTY * max(self._signals.beyond(local), 0.0)) ** -2.0, x
-        scale = self._signals.feasible_scale(local)
-        return scale, scale * x
+            x = tried if penalty < _NEAR and gain > -_WORSE else best
+            trust = (
+                min(trust**2, _WIDEST) if gain > 0.75 * promised else trust if gain > 0.25 * promised else trust**0.5
+            )
+        return _Solution(best, duration)
 
 
 class _Signals:
@@ -226,10 +300,7 @@ class _Signals:
     def _at_rest(self) -> NDArray[np.bool_]:
         """Points (npoints,) at which the plan is at rest."""
         found = np.zeros((self._grid.length.size, self._points.size), dtype=bool)
-        firsts = np.flatnonzero(np.diff(self._grid.part, prepend=-1))
-        for part, begin, end in zip(self._grid.parts, firsts, [*firsts[1:], len(found)], strict=True):
-            found[begin, 0] = part.spans[0].rests[0] > 0.0
-            found[end - 1, -1] = part.spans[-1].rests[1] > 0.0
+        found[:, 0], found[:, -1] = self._grid.rests
         return found.ravel()
 
     def _at_given_speeds(self) -> NDArray[np.bool_]:
@@ -267,14 +338,22 @@ class _Signals:
         """Maximum violation at the points with half the reserve, in the scale of the limits."""
         return self._beyond(self._derivatives(local))
 
-    def excess(self, local: Array) -> Array:
-        """Maximum violation in each cell (ncells,), in the scale of the limits."""
+    def excess(self, jet: Array) -> Array:
+        """Maximum violation in each cell (ncells,), in the scale of the limits, by the jets of a law at its points."""
         try:
-            values = self._values(self._derivatives(local))
+            values = self._limited.values(jet)[self._moving] / self._scales
         except ValueError:  # infeasible for the plant
             return np.full(self._grid.length.size, _INFEASIBLE)
-        beyond = np.maximum(values - self._high, self._low - values)
-        return beyond.reshape(len(values), -1, self._points.size).max(axis=(0, 2))
+        beyond = np.concatenate([values - self._high, self._low - values])
+        return _peaks(beyond.reshape(len(beyond), -1, self._points.size)).max(axis=0)
+
+    def losses(self, local: Array) -> Array:
+        """Distance of each cell (ncells,) from the nearest limit, weighted by its part of the duration."""
+        derivatives, shape = self._derivatives(local), (self._grid.length.size, self._points.size)
+        values = self._values(derivatives)
+        distance = np.clip(np.minimum(self._high - values, values - self._low).min(axis=0), 0.0, 1.0).reshape(shape)
+        durations = (1.0 / np.sqrt(np.maximum(derivatives[0], _TINY))).reshape(shape) * self._grid.length[:, None]
+        return (distance * durations).mean(axis=1) / durations.mean(axis=1).sum()
 
     def rows(self, local: Array, reserve: Array) -> Rows:
         """Inequalities of the linearised signals for the Bernstein coefficients of the cells."""
@@ -311,7 +390,7 @@ class _Signals:
         """Signals (nbounds, ..., npoints) in the scale of their limits, by derivatives (order, ..., npoints) of b."""
         shape = derivatives.shape[1:]
         b, slope, bend, third, fourth = np.concatenate([derivatives, np.zeros((HIGHEST - self._order, *shape))])
-        rate = np.sqrt(np.maximum(b, 1e-300))
+        rate = np.sqrt(np.maximum(b, _TINY))
         series = [
             rate,
             slope / 4.0,
@@ -335,3 +414,14 @@ class _Signals:
             values - self._high + reserve * self._high_share, self._low - values + reserve * self._low_share
         )
         return min(float(excess[signed | ~self.strict[:, 0]].max(initial=-_BEYOND)), _BEYOND)
+
+
+def _peaks(values: Array) -> Array:
+    """Maxima (...) of evenly spaced samples (..., npoints) and of the parabolas through three of them."""
+    before, inner, after = values[..., :-2], values[..., 1:-1], values[..., 2:]
+    bend, slope = before - 2.0 * inner + after, after - before
+    # Without a limit at one of them they are no parabola.
+    inside = (np.abs(slope) < -2.0 * bend) & (np.minimum(before, after) > -1.0)
+    vertices = np.where(inside, inner - slope**2 / np.where(inside, 8.0 * bend, 1.0), inner)
+    peaks: Array = np.maximum(vertices.max(axis=-1), values.max(axis=-1))
+    return peaks
