@@ -540,16 +540,6 @@ class NewtonSystem(Fields):
         """The same from the third function on, as an array."""
         return readonly(np.array(self.ranges[1:]))
 
-    @property
-    def starts_with_positions(self) -> bool:
-        """Whether the first two coefficients lead from one position to the other of two waypoints."""
-        return self._is_short == 2
-
-    @cached_property
-    def first_range(self) -> float:
-        """Distance of these positions relative to the second coefficient."""
-        return abs(float(self._triangle.item(1, 1)))
-
     def stays_near(self, coefficients: Array, factor: float, spans: Callable[[], list[float]]) -> bool:
         """Whether coefficients exclude ranges above a multiple of those of the positions.
 
@@ -569,8 +559,8 @@ class NewtonSystem(Fields):
         if self._fold or not self._is_short:
             return False
         columns, ranges = coefficients.T.tolist(), self.ranges
-        if self.starts_with_positions:
-            slope = factor * self.first_range
+        if self._is_short == 2:
+            slope = factor * abs(self._triangle.item(1, 1))
             allowed = [slope * abs(column[1]) for column in columns]
         else:
             allowed = [factor * span for span in spans()]

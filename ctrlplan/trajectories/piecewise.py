@@ -38,9 +38,6 @@ from ctrlplan.trajectories.waypoint_spline import (
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
-_ALLOWED = 0.5 * (MAXIMUM_SWING - 1.0)
-"""Range that the functions of a segment may add on either side, relative to that of the positions."""
-
 _FEW = 16
 """Number of segments up to which each is evaluated by itself at few times, and interpolants are kept."""
 
@@ -394,34 +391,25 @@ class PiecewiseSpline(WaypointSpline):
         """
         if self.alpha > math.pi:
             return False
+        positions = self._entries.rows[:, 0]
+        lowest, highest = np.minimum.reduce(positions, axis=1), np.maximum.reduce(positions, axis=1)
+        allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (highest - lowest)
         for pieces in self._pieces:
+            axes = list(pieces.axes)
             for run in pieces.runs:
                 if not run.system.hermite:
                     return False
                 weights = run.system.higher_ranges
                 if not weights.size:
                     continue
-                sizes = np.abs(run.coefficients)
-                own = (weights @ sizes[2:].reshape(weights.size, -1)).reshape(sizes.shape[1:])
-                # The range of the positions is at least that of one segment, the coefficient of its second function.
-                if run.system.starts_with_positions:
-                    step = run.system.first_range * np.maximum.reduce(sizes[1], axis=1, keepdims=True)
-                    if (own <= _ALLOWED * step).all():
-                        continue
-                if not self._within(list(pieces.axes), run, own):
+                sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
+                near = (weights @ sizes).reshape(len(axes), -1) <= allowed[axes, None]
+                if near.all():
+                    continue
+                low, high = _range(run, np.flatnonzero(~near.all(axis=0)))
+                if not ((low >= (lowest - allowed)[axes]) & (high <= (highest + allowed)[axes])).all():
                     return False
         return True
-
-    def _within(self, axes: list[int], run: Run, own: Array) -> bool:
-        """Whether a run stays near the positions of all waypoints, from bounds (naxes, nsegments) of its functions."""
-        positions = self._entries.rows[axes, 0]
-        lowest, highest = positions.min(axis=1), positions.max(axis=1)
-        allowed = _ALLOWED * (highest - lowest)
-        near = (own <= allowed[:, None]).all(axis=0)
-        if near.all():
-            return True
-        low, high = _range(run, np.flatnonzero(~near))
-        return bool(((low >= lowest - allowed) & (high <= highest + allowed)).all())
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
