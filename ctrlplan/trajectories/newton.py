@@ -83,6 +83,9 @@ _MAXIMUM_DIGITS = 100
 _RESOLVED = 3e-14
 """Size of the last coefficients of an interpolant relative to its mean, below which others do not matter."""
 
+_KEPT = 64
+"""Number of constraints up to which their order is kept for other times."""
+
 _SHORT = 4
 """Maximum number of waypoints whose coefficients bound the range of a plan."""
 
@@ -163,7 +166,7 @@ class NewtonSystem(Fields):
         size = count if size is None else size
         moments = times.tolist()
         ordered, meet = _leja(effective(alpha), moments, given, meet)
-        pattern = _pattern(ordered, given, meet)
+        pattern = (_kept_pattern if count <= _KEPT else _pattern)(ordered, given, meet)
         mean = math.fsum([moments[i] for i in pattern.at]) / count
         phase, fold = _top_harmonic(alpha, size, mean, gamma)
         nodes = times.take(pattern.waypoints)
@@ -756,7 +759,6 @@ class _Pattern(NamedTuple):
     is_short: int
 
 
-@lru_cache(maxsize=256)
 def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> _Pattern:
     """Constraints of waypoints in Leja order; ends that coincide come first with all their entries."""
     first = _sequence(ordered[:2], given) if meet else []
@@ -770,6 +772,12 @@ def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet:
     number = len(set(at))
     is_short = number if 2 <= number <= _SHORT and keys[:number] == (0,) * number else 0
     return _Pattern(at, keys, waypoints, orders, positions, int((orders == 0).argmax()), hermite, len(first), is_short)
+
+
+@lru_cache(maxsize=256)
+def _kept_pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> _Pattern:
+    """The same, kept for other times."""
+    return _pattern(ordered, given, meet)
 
 
 def _leja(
