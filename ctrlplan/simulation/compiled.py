@@ -18,6 +18,7 @@ from ctrlplan._types import Array, Params, Value
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.interruptions import passing_interruptions
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
+from ctrlplan.simulation.one_step import EVALUATIONS, LONGEST, OneStep, has_step
 from ctrlplan.simulation.scales import Scales, Tolerances
 from ctrlplan.simulation.signals import Series, within
 from ctrlplan.symbolic.comparison import Compared
@@ -140,6 +141,7 @@ class Compiled:
         self._integrators: Lru[tuple[object, ...], Segment] = Lru(_CACHE_SIZE)
         self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
         self._small: Lru[tuple[int, str, int], _AtMany] = Lru(_CACHE_SIZE)
+        self._steps: Lru[tuple[int, int, bool, bool], OneStep | None] = Lru(_CACHE_SIZE)
         self._equations: dict[tuple[int, bool, bool], dict[str, ca.SX]] = {}
 
     def __getstate__(self) -> dict[str, object]:
@@ -233,6 +235,13 @@ class Compiled:
         # CasADi releases the global interpreter lock: each thread has its own integrators.
         found = self._integrators.get((threading.get_ident(), settings), lambda: self._made(settings))
         return self._made(settings) if found.is_running else found  # a handler of a signal may simulate
+
+    def one_step(self, settings: Settings) -> OneStep | None:
+        """One step over a segment scaled to length 1; None if the equations are too long."""
+        equations = self._segment_equations(settings.width, settings.harmonic, settings.scaled)
+        key = threading.get_ident(), settings.width, settings.harmonic, settings.scaled
+        found = self._steps.get(key, lambda: OneStep(equations) if has_step(equations) else None)
+        return OneStep(equations) if found is not None and found.is_running else found
 
     def has_integrator(self, settings: Settings) -> bool:
         """Whether an integrator has been built."""
@@ -515,6 +524,10 @@ class CompiledSolver:
 
     def _solved(self, settings: Settings, arguments: Arguments, relative: Array) -> Array:
         """Scaled states at the relative times; a diverging solution exhausts the steps."""
+        if relative.size == 1 and not settings.longest and self._motion.norm * arguments[2][1] <= LONGEST:
+            found = self._in_one_step(settings, arguments)
+            if found is not None:
+                return found
         if settings.kind is Kind.FIXED_POINT:
             with suppress(_SegmentError):  # the equations may have become stiff
                 return self._tried(settings, arguments)
@@ -528,6 +541,16 @@ class CompiledSolver:
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
         found = self._tried(settings._replace(grid=close.tobytes(), max_steps=self._max_steps), arguments)
         return found[:, np.searchsorted(close, relative)]
+
+    def _in_one_step(self, settings: Settings, arguments: Arguments) -> Array | None:
+        """Scaled states at the end of a segment by one step; None if it is not accurate enough."""
+        step = self.form.one_step(settings)
+        if step is None:
+            return None
+        start, known, span, held = arguments
+        found = step.state(start, (known, span, held), settings.rtol, settings.atol)
+        self.evaluations += EVALUATIONS * self._counts
+        return None if found is None else found[:, None]
 
     def _tried(self, settings: Settings, arguments: Arguments) -> Array:
         integrator = self.form.integrator(settings)

@@ -310,7 +310,7 @@ def _near(
         found = value(t)
         change = found / slope
         if abs(change) > tolerance:
-            t -= change
+            t += 0.5 * tolerance - change  # probably on the side of `right`
         elif found * at_right >= 0.0:
             return t
         else:

@@ -17,7 +17,7 @@ def fingerprint(system: System) -> tuple[object, ...]:
     """Fingerprint of a system, equal only if nothing that a run depends on has changed."""
     params = getattr(system, "params", None)
     own = (id(system), str(system.name), system.dt, value_token(params) if params else ())
-    # Labels with their numbers; lists of them would be sorted anew each time.
+    # Labels with their numbers; lists of them would be sorted at each reading.
     labels = tuple(tuple(index.items()) for index in (system.input_index, system.output_index, system.state_index))
     if isinstance(system, ct.InterconnectedSystem):
         maps = tuple(np.asarray(m).tobytes() for m in (system.connect_map, system.input_map, system.output_map))
