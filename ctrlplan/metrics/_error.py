@@ -167,7 +167,7 @@ def _known_areas(t: Array, f: Array, begin: Array | None) -> tuple[float, NDArra
 def _smooth_areas(smooth: Smooth, f: Array, begin: Array | None) -> tuple[float, NDArray[np.intp]]:
     """Return the same for a long signal, with sign and smooth curvature known."""
     areas, known = smooth.areas(f, begin)
-    return float(np.abs(areas) @ known), np.concatenate([[0], np.flatnonzero(~known) + 1, [f.size - 2]])
+    return float(np.abs(areas[known]).sum()), np.concatenate([[0], np.flatnonzero(~known) + 1, [f.size - 2]])
 
 
 def _areas(p: Pieces, since: float | None) -> Array:

@@ -134,20 +134,20 @@ class Together:
         """Whether each loop is unstable, shape (nloops,)."""
         return np.asarray(in_right_half(self.form.poles).any(axis=1))
 
-    def outputs(self, names: Sequence[str], plans: Mapping[str, Trajectory], times: Array) -> dict[str, Array]:
-        """Outputs of the loops by plan, shape (nloops, nnames, ntime).
+    def outputs(self, labels: Sequence[str], name: str, plan: Trajectory, times: Array) -> Array:
+        """Outputs of the loops, shape (nloops, nlabels, ntime).
 
         Parameters
         ----------
-        names : sequence of str
+        labels : sequence of str
             Outputs wanted.
-        plans : mapping of str to Trajectory
-            The plans at the inputs.
+        name, plan : str, Trajectory
+            The plan at the inputs.
         times : ndarray, shape (ntime,)
             Sample times [s].
         """
-        rows = [self.labels.index(name) for name in names]
-        return {name: _outputs(self.form, rows, plan, times, self.starts[name]) for name, plan in plans.items()}
+        rows = [self.labels.index(label) for label in labels]
+        return _outputs(self.form, rows, plan, times, self.starts[name])
 
 
 def _at_rest(form: LinearForm, starts: Mapping[str, Array], held: Mapping[str, Array]) -> NDArray[np.bool_]:

@@ -266,7 +266,7 @@ def _compared(
     def limited(run: Run) -> dict[str, float]:
         options = laws[id(run.plan)]
         own = as_law(options.get("law", "generator")).outputs != Law.outputs  # the law commands force and torque
-        return {"error_limited": np.nan if own else _limited_error(run.plan, options, timepts)}
+        return {"error_limited": np.nan if own else _limited_error(run, options, timepts)}
 
     found = compare(
         build,
@@ -283,14 +283,25 @@ def _compared(
     return marked_slack(found)
 
 
-def _limited_error(plan: Trajectory, options: _Loop, timepts: Array) -> float:
+def _limited_error(run: Run, options: _Loop, timepts: Array) -> float:
     """Peak tracking error with the force and torque limits of the step run; nan if the rope becomes slack."""
-    loop = crane_loop(CRANE, plan, **options | {"force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS})
-    response = simulate(loop, timepts, events=(SLACK,))
+    response = run.response
+    if "force_limits" not in options and _reaches_limits(run):
+        loop = crane_loop(CRANE, run.plan, **options | {"force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS})
+        response = simulate(loop, timepts, events=(SLACK,))
     if response.time[-1] < timepts[-1]:
         return np.nan
     signals = signals_of(response)
-    return float(np.hypot(*(np.stack([signals["x"], signals["z"]]) - plan.jet(timepts, 0)[0])).max())
+    return float(np.hypot(*(np.stack([signals["x"], signals["z"]]) - run.plan.jet(timepts, 0)[0])).max())
+
+
+def _reaches_limits(run: Run) -> bool:
+    """Whether force or torque of an unlimited run come close to the limits, also between samples."""
+    middles = ((name, 0.5 * (low + high), 0.5 * (high - low)) for name, (low, high) in _LIMITS.items())
+    return any(metrics.peak(run.t, run.signals[name] - middle) > 0.99 * half for name, middle, half in middles)
+
+
+_LIMITS = {"F": FORCE_LIMITS, "C": TORQUE_LIMITS}
 
 
 def _limits_note(found: Comparison) -> str:

@@ -345,17 +345,18 @@ class Experiment(Displayed):
         """
         numbers = [loop if isinstance(loop, Linear) else self.numbers_of(loop) for loop in loops]
         alike = [loop for loop in numbers if loop is not None]
-        held, duration = self._held, float(self.timepts[-1] - self.timepts[0])
+        held = self._held
         if held is None or not alike or len(alike) < len(numbers) or not all(loop.fits(alike[0]) for loop in alike):
             return None
+        duration = float(self.timepts[-1] - self.timepts[0])
         together, usable = Together.of(alike, held, duration, self.initial_state)
         tracked = alike[0].tracked
         acting = alike[0].acting if samples is not None or self._listed("control") else ()
-        signals, unstable = together.outputs((*tracked, *acting), self.plans, self.timepts), together.is_unstable()
+        unstable = together.is_unstable()
         found: list[Metrics] = [{} for _ in usable]
         stored: list[dict[str, dict[str, Array]]] = [{} for _ in usable]
         for name, plan in self.plans.items() if usable.size else ():
-            rows = signals.pop(name)
+            rows = together.outputs((*tracked, *acting), name, plan, self.timepts)
             for i, curves in enumerate(stored) if samples is not None else ():
                 curves[name] = dict(zip((*tracked, *acting), rows[i][:, samples], strict=True))
             y, u = np.split(rows, [len(tracked)], axis=1)

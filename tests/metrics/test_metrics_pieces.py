@@ -196,3 +196,13 @@ def test_integrals_and_peaks_of_long_signals_are_those_of_every_cubic(kind, spre
     between = np.abs(cubics(fine[:, None])).max()
     bend = np.abs(cubics.c).max() + 3 * np.abs(cubics.d).max()
     assert between - 1e-14 * np.abs(f).max() <= metrics.peak(t, f) <= between + 0.5 * (0.5 / 200) ** 2 * 2 * bend
+
+
+@pytest.mark.parametrize("metric", [metrics.iae, metrics.itae, metrics.peak])
+def test_long_signals_whose_differences_overflow_are_straight_lines_there(metric):
+    """Slopes of 1e314: chords, which miss (spacing)^2 / 8 of the second derivative."""
+    count, size = 800, 1e302
+    t = np.linspace(0.0, 1e-12, count)
+    turn = 2 * np.pi * t / t[-1]
+    chord = (2 * np.pi / (count - 1)) ** 2 / 8
+    assert metric(t, size * np.sin(turn)) / size == pytest.approx(metric(t, np.sin(turn)), rel=2 * chord)

@@ -295,6 +295,23 @@ def test_a_loop_is_built_once_for_each_value(count):
     np.testing.assert_allclose(found.metrics["step"]["overshoot_error"], expected, rtol=1e-5)
 
 
+def test_a_builder_may_modify_its_loop_although_some_loops_are_run_separately():
+    """First-order lag 1/(s + r): integral of (1 - y)^2 for a step. Loops that grow by exp(20) are run separately."""
+    rates, end = np.array([-3.5, -3.0, -2.5, -0.5, 0.5, 1.0, 2.0, 3.0, 4.0]), 10.0
+    loop = ct.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], inputs="r", outputs="y")
+
+    def build(rate):
+        loop.A[0, 0] = -rate
+        return loop
+
+    times = np.linspace(0.0, end, 2001)
+    found = cp.sweep(build, rates, {"step": cp.Step(1.0)}, times, progress=False, measures=["ise"])
+    offset, decay = 1.0 - 1.0 / rates, np.exp(-rates * end)
+    expected = offset**2 * end + 2.0 * offset * (1.0 - decay) / rates**2 + (1.0 - decay**2) / (2.0 * rates**3)
+    # Cubics over intervals h have an error of (r h)^4 / 384, twice that of their squares.
+    np.testing.assert_allclose(found.metrics["step"]["ise"], expected, rtol=1e-7)
+
+
 def test_a_loop_is_built_once_for_each_value_even_where_one_cannot_be():
     built = []
 
