@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import pairwise
@@ -434,10 +435,11 @@ def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, f
             law = other if law is None else law
             if span is not None:
                 break
-        if any(_is_signed(bound) for bound in limited.bounds):
+        signed = [bound for bound in limited.bounds if _is_signed(bound)]
+        if signed:
             raise ValueError(
-                "limits that forbid a sign must be satisfied by a time law on the path, got none that is found; give a "
-                "small limit instead of 0"
+                f"limits of {signed[0].name} must allow both signs unless a time law on the path has one sign "
+                f"throughout, got {signed[0].range}, and no such law is found; give a small limit instead of 0"
             )
     else:
         _check_open(plan)
@@ -493,9 +495,11 @@ def _check_not_vanishing(plan: Trajectory, found: Fastest) -> None:
     longer = 1.01 * found.plan.duration
     slower = ReplannedPlans(plan, limited).plan(longer) if found.hold == "waypoints" else found.plan.retime(longer)
     if any(slack - other.fraction > 0.5 * slack for other in limited.margins(slower).rows if other.of(row.bound)):
+        with suppress(ValueError):  # infeasible for the plant in its own duration
+            row = next(own for own in limited.margins(plan) if own.of(row.bound))
         raise ValueError(
             "limits must be satisfied for some duration, got a violation that tends to 0 only with the speed of the "
-            f"plan: {row}; change this limit or the shape of the plan"
+            f"plan: {row}; give a small limit instead of 0, or another shape of the plan"
         )
 
 

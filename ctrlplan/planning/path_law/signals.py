@@ -240,7 +240,11 @@ class _Problems:
         edges = np.searchsorted(law(law.breakpoints), self._grid.times(np.array([0.5]))[0]) - 1
         starts, durations = law.breakpoints[edges, None], np.diff(law.breakpoints)[edges, None]
         times = (starts + durations * _CHECKS).ravel()
-        return self._between.excess(Retimed(self._grid.plan, law).jet(times, self._limited.order))
+        try:
+            retimed = Retimed(self._grid.plan, law)
+        except ValueError:  # a law that does not increase between the ends of a cell
+            return np.full(self._grid.length.size, _INFEASIBLE)
+        return self._between.excess(retimed.jet(times, self._limited.order))
 
     def _converged(self, x: Array, reserves: Array) -> _Solution:
         """Local minimum near coefficients, with a distance (ncells,) from the limits in each cell.
