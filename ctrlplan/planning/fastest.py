@@ -323,9 +323,10 @@ def fastest(
 
     With fixed path and other limits (quantities, derivatives of order 4, accelerations
     of one sign) that depend on at most five derivatives of the plan, the quartic spline is found by a sequence of
-    linearised problems: a local minimum. For a crane it was within 0.3 % of the
-    solution of the nonlinear program on a fine grid. The law has four continuous
-    derivatives between stops. With limits that depend on a sixth one or higher the rate
+    linearised problems: a local minimum. Its cells are divided while that shortens
+    the duration by more than 0.1 %. For a crane it was within 0.5 % of nonlinear
+    programs whose laws satisfy the limits between their points as well. The law has
+    four continuous derivatives between stops. With limits that depend on a sixth one or higher the rate
     is a spline with 16 knots in the time of the given plan, and the duration depends
     on the timing of that plan.
 
@@ -429,7 +430,10 @@ def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, f
         _check_signs(plan, limited, given=False)
         _closed_form(plan, limited, 1)  # raises for a direction in which no velocity is allowed
         for other in fast_laws_of_signals(plan.shift(-start), limited, start):
-            found = _at_its_limit(other.shift(start), limited) if span is None else None
+            try:
+                found = _at_its_limit(other.shift(start), limited) if span is None else None
+            except RuntimeError:  # a quantity is not resolved where derivatives of the law multiply rounding
+                continue
             if found is not None:
                 return found
             law = other if law is None else law
