@@ -164,8 +164,8 @@ class Limits:
         if isinstance(limit, Limits):
             return limit
         if is_listed(limit):
-            if len(limit) != 2:
-                raise ValueError(f"limits of {name} must be a number or a pair, got {limit!r}")
+            if len(limit) != 2 or any(is_listed(side) for side in limit):
+                raise ValueError(f"limits of {name} must be a number or a pair of numbers, got {limit!r}")
             limit = _sides(*limit)
         elif isinstance(limit, bool) or not isinstance(limit, Real | np.ndarray):
             raise TypeError(f"limits of {name} must be a number or a pair, got {limit!r}")
@@ -517,7 +517,7 @@ def _sides(low: Any, high: Any) -> tuple[float, float]:
 def is_listed(limit: object) -> TypeGuard[Sequence[float | None]]:
     """Whether limits are a list or array."""
     given: Any = limit
-    return bool(np.ndim(given))
+    return isinstance(given, list | tuple) or bool(np.ndim(given))
 
 
 def _checked_rate(rate: object, during: bool) -> Pair:

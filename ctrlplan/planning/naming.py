@@ -197,8 +197,10 @@ def _by_axis(name: str, limit: object, naxes: int) -> list[object]:
         return [tuple(rows)] * naxes
     if len(rows) == naxes and (not given if flat else [np.size(row) for row in rows] == [2] * naxes):
         return rows
+    mixed = len(rows) == naxes and not flat and not all(map(np.iterable, rows))
+    further = "; give a pair for every axis, (-a, a) instead of the number a" if mixed else f"; {_FORMS}"
     raise ValueError(
-        f"limits of {name} must be a number, a pair, or {naxes} numbers or pairs by axis, got {limit!r}; {_FORMS}"
+        f"limits of {name} must be a number, a pair, or {naxes} numbers or pairs by axis, got {limit!r}{further}"
     )
 
 

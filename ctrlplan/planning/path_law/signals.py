@@ -71,6 +71,9 @@ _TIGHTENINGS = 6
 _ALLOWED = (3e-4, -1e-4, -1e-3)
 """Violations between the points of laws, one after the other until one satisfies the limits or is slowed to do so."""
 
+_ROUNDING = 1e-12
+"""Violation that is rounding."""
+
 _INFEASIBLE = 0.05
 """Violation attributed to a plan that is infeasible for the plant between the points."""
 
@@ -221,7 +224,7 @@ class _Problems:
             for _ in range(_TIGHTENINGS):
                 law = self._time_law(x)
                 excess = self._excess(law)
-                if excess.max() <= most:
+                if excess.max() <= most + _ROUNDING:
                     yield law
                     break
                 reserves += 1.5 * np.maximum(excess - min(most, 0.0), 0.0)
@@ -237,7 +240,11 @@ class _Problems:
         edges = np.searchsorted(law(law.breakpoints), self._grid.times(np.array([0.5]))[0]) - 1
         starts, durations = law.breakpoints[edges, None], np.diff(law.breakpoints)[edges, None]
         times = (starts + durations * _CHECKS).ravel()
-        return self._between.excess(Retimed(self._grid.plan, law).jet(times, self._limited.order))
+        try:
+            retimed = Retimed(self._grid.plan, law)
+        except ValueError:  # a law that does not increase between the ends of a cell
+            return np.full(self._grid.length.size, _INFEASIBLE)
+        return self._between.excess(retimed.jet(times, self._limited.order))
 
     def _converged(self, x: Array, reserves: Array) -> _Solution:
         """Local minimum near coefficients, with a distance (ncells,) from the limits in each cell.
@@ -256,7 +263,7 @@ class _Problems:
                     break
                 continue
             beyond, own, solved = self._signals.beyond(self._spline.coefficients(tried)), problem.duration(tried), True
-            if beyond >= _BEYOND and not math.isfinite(duration):  # infeasible for the plant
+            if math.isinf(beyond) and math.isinf(duration):  # infeasible for the plant
                 trust **= 0.5
                 continue
             penalty = 1.0 + _PENALTY * max(beyond, 0.0)
@@ -318,7 +325,7 @@ class _Signals:
         derivatives = self._derivatives(local)
 
         def beyond(scale: float) -> float:
-            return self._beyond(scale * derivatives, signed=False)
+            return min(self._beyond(scale * derivatives, signed=False), _BEYOND)
 
         low = high = 1.0
         while high < largest and beyond(high) <= 0.0:
@@ -404,16 +411,16 @@ class _Signals:
         return (self._limited.values(jet)[self._moving] / self._scales).reshape(-1, *shape)
 
     def _beyond(self, derivatives: Array, signed: bool = True) -> float:
-        """Maximum violation with half the reserve, up to `_BEYOND`; also, if `signed`, of limits that forbid a sign."""
+        """Maximum violation with half the reserve, of limits that forbid a sign if `signed`; inf if infeasible."""
         try:
             values = self._values(derivatives)
         except ValueError:  # infeasible for the plant
-            return _BEYOND
+            return math.inf
         reserve = 0.5 * _RESERVE
         excess = np.maximum(
             values - self._high + reserve * self._high_share, self._low - values + reserve * self._low_share
         )
-        return min(float(excess[signed | ~self.strict[:, 0]].max(initial=-_BEYOND)), _BEYOND)
+        return float(excess[signed | ~self.strict[:, 0]].max(initial=-_BEYOND))
 
 
 def _peaks(values: Array) -> Array:

@@ -123,7 +123,7 @@ def _check_speed(where: str, rate: float, largest: float) -> None:
 
 def _lines(one: Array, other: Array) -> tuple[Array, Array]:
     """Offsets and slopes (ncells, nrows) of the upper limits of a rate by the rate at the other end."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # of the slowest plans
         limits = one > 1e-14 * np.abs(other)
         return np.where(limits, 1.0 / one, _FAR), np.where(limits, -other / one, 0.0)
 
