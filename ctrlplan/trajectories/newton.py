@@ -83,8 +83,8 @@ _MAXIMUM_DIGITS = 100
 _RESOLVED = 3e-14
 """Size of the last coefficients of an interpolant relative to its mean, below which others do not matter."""
 
-_KEPT = 64
-"""Number of constraints up to which their order is kept for other times."""
+_STORED = 64
+"""Number of constraints up to which their order is stored for other times."""
 
 _SHORT = 4
 """Maximum number of waypoints whose coefficients bound the range of a plan."""
@@ -166,7 +166,7 @@ class NewtonSystem(Fields):
         size = count if size is None else size
         moments = times.tolist()
         ordered, meet = _leja(effective(alpha), moments, given, meet)
-        pattern = (_kept_pattern if count <= _KEPT else _pattern)(ordered, given, meet)
+        pattern = (_stored_pattern if count <= _STORED else _pattern)(ordered, given, meet)
         mean = math.fsum([moments[i] for i in pattern.at]) / count
         phase, fold = _top_harmonic(alpha, size, mean, gamma)
         nodes = times.take(pattern.waypoints)
@@ -568,7 +568,10 @@ class NewtonSystem(Fields):
         else:
             allowed = [factor * span for span in spans()]
         return all(
-            [sum(map(mul, map(abs, column[1:]), ranges)) <= most for column, most in zip(columns, allowed, strict=True)]
+            [
+                sum(map(mul, map(abs, column[1:]), ranges)) <= limit
+                for column, limit in zip(columns, allowed, strict=True)
+            ]
         )
 
     @cached_property
@@ -775,8 +778,8 @@ def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet:
 
 
 @lru_cache(maxsize=256)
-def _kept_pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> _Pattern:
-    """The same, kept for other times."""
+def _stored_pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> _Pattern:
+    """The same, stored for other times."""
     return _pattern(ordered, given, meet)
 
 

@@ -509,7 +509,7 @@ class PiecewiseSpline(WaypointSpline):
         return self._jets(segments, t - times[segments], low, high), False
 
     def _known_rows(self, low: int, high: int) -> tuple[Array, bool]:
-        """Rows of interpolants of all segments of a plan of few, which are kept, and whether they are finite."""
+        """Rows of interpolants of all segments of a plan of few, which are stored, and whether they are finite."""
         if (low, high) not in self._rows_by_orders:
             rows = readonly(self._rows_of(np.arange(self._durations.size), low, high))
             self._rows_by_orders[low, high] = rows, are_finite(rows)

@@ -176,7 +176,7 @@ def sample_segments(
             back = np.empty_like(order)
             back[order] = np.arange(order.size)
             for values, target in zip(found.reshape(-1, part.size), out.reshape(-1, t.size), strict=True):
-                values.take(back, out=target[begin : begin + part.size], mode="clip")  # which needs no copy
+                values.take(back, out=target[begin : begin + part.size], mode="clip")  # without a copy
     return finite
 
 
