@@ -63,6 +63,9 @@ _PATTERNS, _APART = 16, 12
 """Number of patterns of output times for which a run builds integrators; further patterns of up to so many times are
 integrated to each time from the start of the segment."""
 
+_FEW_SHORT = 4
+"""Number of short segments of a run that CVODES passes, as one step must be built: further ones are passed by that."""
+
 _EDGE = 100.0
 """Neighbourhood of a state, in tolerances of a step, in which the equations must be defined."""
 
@@ -403,7 +406,7 @@ class CompiledSolver:
         self._scaled = bool(np.any(self._shift != 0.0) or np.any(self._scale != 1.0))
         self._tolerances = float(tolerances.rtol.min(initial=1.0)), tolerances.atol
         self._longest, self._kind, self._segments, self._patterns = 0.0, Kind.ADAMS, 0, 0
-        self._motion = Motion(0.0, 0.0)
+        self._motion, self._short = Motion(0.0, 0.0), 0
         self._counts = equations.compared.is_expected
         self._series: Series | None = None
         self._known = np.empty(0)
@@ -525,7 +528,8 @@ class CompiledSolver:
     def _solved(self, settings: Settings, arguments: Arguments, relative: Array) -> Array:
         """Scaled states at the relative times; a diverging solution exhausts the steps."""
         if relative.size == 1 and not settings.longest and self._motion.norm * arguments[2][1] <= LONGEST:
-            found = self._in_one_step(settings, arguments)
+            self._short += 1
+            found = self._in_one_step(settings, arguments) if self._short > _FEW_SHORT else None
             if found is not None:
                 return found
         if settings.kind is Kind.FIXED_POINT:
