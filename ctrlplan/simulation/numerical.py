@@ -44,8 +44,9 @@ _DISPLACED, _JITTER = 4, 1e-3
 _STEEP = 30.0
 """Ratio of (slope times state) to the largest derivative above which it counts as strongly nonlinear."""
 
-_GROWTH, _TIGHTEST = 30.0, 1e4
-"""Growth of a perturbation along a run above which tolerances are reduced, and the maximum reduction."""
+_GROWTH, _TIGHTEST, _IN_VAIN = 30.0, 1e4, 1e2
+"""Growth of a perturbation along a run above which tolerances are reduced, the maximum reduction, and the reduction
+where even the maximum would not suffice: near rounding errors a run takes minutes."""
 
 _UNCERTAIN = 1e-6
 """Uncertainty of an output, relative to its range, above which it is reported in the response."""
@@ -140,7 +141,8 @@ def _tightened(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
     attempt.growth = growth
     if growth <= _GROWTH:
         return attempt
-    tighter = min(growth / _GROWTH, _TIGHTEST)
+    needed = growth / _GROWTH
+    tighter = needed if needed <= _TIGHTEST else _IN_VAIN
     try:
         again = Attempt(fresh, attempt.method, scales, tighter)
         again.go()
