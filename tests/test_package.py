@@ -216,7 +216,7 @@ def test_every_public_function_and_class_is_described(name):
 
 
 # Not for users: what printing renders, and what other folders of the package read.
-INTERNAL = {"Table", "Linear", "TimeSignal", "DisagreementError", "Limited", "NewtonSpline", "PathMaps"}
+INTERNAL = {"Table", "Linear", "TimeSignal", "TimeSignals", "DisagreementError", "Limited", "NewtonSpline", "PathMaps"}
 
 
 def results_of(thing):
