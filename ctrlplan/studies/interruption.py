@@ -44,12 +44,12 @@ def counting_interruptions() -> Iterator[Sequence[int]]:
 
 @contextmanager
 def holding_back(held: bool = True) -> Iterator[None]:
-    """Context in which a first Ctrl-C is raised at the end, and a second one at once.
+    """Context in which a first Ctrl-C raises at the end; a second one raises within.
 
     For short calls of an executor that an exception in between would leave half
-    done: a client of dask, for one, then receives no further result. Runs
-    within such a call, of an executor that runs its tasks in this thread, are not
-    ``held``.
+    done: a client of dask, for example, then receives no further result.
+    ``held=False`` is for runs within such a call, if the executor runs its tasks in
+    this thread.
     """
     before = len(_PRESSED.get())
     token = _HELD_BACK.set(held)
