@@ -9,6 +9,8 @@ from time import perf_counter, process_time
 
 import numpy as np
 import pytest
+from in_turn import in_turn
+from path_program import optimum
 from scipy.optimize import brentq, minimize_scalar
 
 import ctrlplan as cp
@@ -162,6 +164,30 @@ def test_fastest_next_to_the_closed_form_on_samples(benchmark, capsys, name):
     own, other = (1e3 * median(column) for column in zip(*rows, strict=True))
     with capsys.disabled():
         print(f"\nfastest, {name}: {own:.2f} ms, closed form on 2001 samples {other:.2f} ms, ratio {ratio:.1f}")
+
+
+@pytest.mark.benchmark(group="fastest")
+def test_quantities_of_the_crane_on_a_path(benchmark, capsys):
+    """Peer: CasADi and IPOPT on 300 intervals, whose limits hold at the nodes. Goal: durations within 1 %."""
+    plan, limits = PLANS["polynomial"], {"F": 30e3, "theta": 0.5}
+    guess = cp.fastest(plan, limits, CRANE).duration
+    optimum(plan, guess, limits)  # loads IPOPT
+    benchmark.pedantic(lambda: cp.fastest(plan, limits, CRANE, hold="path"), rounds=1, warmup_rounds=1)
+
+    def ours():
+        return cp.fastest(plan, limits, CRANE, hold="path")
+
+    rows, (found, duration) = in_turn(ours, lambda: optimum(plan, guess, limits), 3)
+    ratio = median(a / b for a, b in rows)
+    benchmark.extra_info |= {"ratio": ratio, "duration": found.duration / duration}
+    assert found.margins.satisfied
+    assert found.duration <= 1.01 * duration
+    own, other = (1e3 * median(column) for column in zip(*rows, strict=True))
+    with capsys.disabled():
+        print(
+            f"\nfastest on a path, force and sway: {own:.0f} ms, IPOPT {other:.0f} ms, ratio {ratio:.2f}; "
+            f"duration {found.duration:.4f} s, IPOPT {duration:.4f} s"
+        )
 
 
 OBSTACLES = [cp.Rectangle((8.0, 15.0), (20.0, 60.0)), cp.Disc((3.0, 3.0), 1.0)]
