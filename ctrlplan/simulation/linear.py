@@ -69,12 +69,11 @@ class LinearForm:
         growing, fast = duration * poles.real.max() > _GROWING, duration * np.abs(poles).max() > _FAST
         if growing or fast:
             return bool(growing), bool(fast), False
-        scale = state_scale(self.a)
-        a = duration * self.a * (scale / scale[:, None])
-        rounding = _rounding(a)
-        # norm(exp(a)) <= exp(largest eigenvalue of the symmetric part), which is usually sufficient.
-        bound = np.exp(np.clip(np.linalg.eigvalsh(a + a.T).max(), 0.0, 700.0))
-        nonnormal = rounding * bound > _UNCERTAIN and rounding * largest_change(a, 1.0) ** 2 > _UNCERTAIN
+        rounding = duration * _rounding(self._balanced)
+        bound = np.exp(np.clip(duration * self._growth, 0.0, 700.0))
+        nonnormal = rounding * bound > _UNCERTAIN and (
+            rounding * largest_change(duration * self._balanced, 1.0) ** 2 > _UNCERTAIN
+        )
         return False, False, bool(nonnormal)
 
     def is_sensitive(self, duration: float) -> NDArray[np.bool_]:
@@ -94,10 +93,25 @@ class LinearForm:
 
     def rounding(self, states: Array, inputs: Array) -> Array:
         """Rounding errors of the outputs for states and inputs of given size, shape (noutputs,)."""
-        scale = state_scale(self.a)
+        scale = self._scale
         largest = np.abs(states / scale[:, None]).max(initial=0.0)
         fed = np.abs(self.c) @ scale * largest + np.abs(self.d) @ np.abs(inputs).max(axis=1, initial=0.0)
         return np.asarray(64.0 * np.finfo(float).eps * fed)
+
+    @cached_property
+    def _scale(self) -> Array:
+        """Balancing scale (nstates,) of one loop."""
+        return state_scale(self.a)
+
+    @cached_property
+    def _balanced(self) -> Array:
+        """Matrix A of one loop in balanced states."""
+        return np.asarray(self.a * (self._scale / self._scale[:, None]))
+
+    @cached_property
+    def _growth(self) -> float:
+        """Rate [1/s] so that norm(exp(A t))^2 <= exp(rate t) in balanced states, which is usually sufficient."""
+        return float(np.linalg.eigvalsh(self._balanced + self._balanced.T).max())
 
 
 def _rounding(a: Array) -> Array:

@@ -44,9 +44,13 @@ _DISPLACED, _JITTER = 4, 1e-3
 _STEEP = 30.0
 """Ratio of (slope times state) to the largest derivative above which it counts as strongly nonlinear."""
 
-_GROWTH, _TIGHTEST, _IN_VAIN = 30.0, 1e4, 1e2
-"""Growth of a perturbation along a run above which tolerances are reduced, the maximum reduction, and the reduction
-where even the maximum would not suffice: near rounding errors a run takes minutes."""
+_GROWTH, _TIGHTEST = 30.0, 1e4
+"""Growth of a perturbation along a run above which tolerances are reduced, and the maximum reduction."""
+
+_TIGHT, _COSTLY = 1e2, 10.0
+"""Reduction of tolerances before which the cost of more is measured, and the factor of evaluations that is too large:
+a method of order 5 needs 2.5 times as many, and a hundred times where it resolves rounding errors of the equations.
+"""
 
 _UNCERTAIN = 1e-6
 """Uncertainty of an output, relative to its range, above which it is reported in the response."""
@@ -132,6 +136,7 @@ def _tightened(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
     perturbation = perturbation * np.where(np.arange(perturbation.size) % 2, -1.0, 1.0)
     try:
         near = Attempt(replace(fresh, state=fresh.state + perturbation), attempt.method, scales)
+        near.solver.count()
         near.go()
     except SolverError:
         return attempt
@@ -141,15 +146,18 @@ def _tightened(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
     attempt.growth = growth
     if growth <= _GROWTH:
         return attempt
-    needed = growth / _GROWTH
-    tighter = needed if needed <= _TIGHTEST else _IN_VAIN
-    try:
+    found = attempt
+    for tighter in sorted({min(growth / _GROWTH, limit) for limit in (_TIGHT, _TIGHTEST)}):
         again = Attempt(fresh, attempt.method, scales, tighter)
-        again.go()
-    except SolverError:
-        return attempt
-    again.growth = growth
-    return again
+        again.solver.count()
+        try:
+            again.go()
+        except SolverError:
+            break
+        again.growth, found = growth, again
+        if again.solver.evaluations > _COSTLY * near.solver.evaluations:
+            break
+    return found
 
 
 def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
