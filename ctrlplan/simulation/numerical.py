@@ -48,8 +48,8 @@ _GROWTH, _TIGHTEST = 30.0, 1e4
 """Growth of a perturbation along a run above which tolerances are reduced, and the maximum reduction."""
 
 _TIGHT, _COSTLY = 1e2, 10.0
-"""Reduction of tolerances before which the cost of more is measured, and the factor of evaluations that is too large:
-a method of order 5 needs 2.5 times as many, and a hundred times where it resolves rounding errors of the equations.
+"""Reduction of tolerances after which evaluations are counted, and the factor of their number that ends it: a method
+of order 5 makes 2.5 times as many, and a hundred times where it resolves rounding errors of the equations.
 """
 
 _UNCERTAIN = 1e-6
