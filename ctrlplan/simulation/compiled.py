@@ -272,13 +272,13 @@ class Compiled:
         function = self._functions[name]
         if not function.numel_out(0):  # no signals without inputs and outputs
             return np.zeros((0, t.size))
-        if t.size > _AT_ONCE:
-            at_all = _AtMany(self._maps.get((name, t.size), lambda: function.map(t.size)), t.size)
-        else:
-            key = threading.get_ident(), name, t.size
-            at_all = self._small.get(key, lambda: _AtMany(function.map(t.size), t.size))
-            if at_all.is_running:  # a handler of a signal may simulate
-                at_all = _AtMany(function.map(t.size), t.size)
+
+        def made() -> _AtMany:
+            return _AtMany(self._maps.get((name, t.size), lambda: function.map(t.size)), t.size)
+
+        at_all = made() if t.size > _AT_ONCE else self._small.get((threading.get_ident(), name, t.size), made)
+        if at_all.is_running:  # a handler of a signal may simulate
+            at_all = made()
         return at_all.values(t, x, time_values, p)
 
     def _segment_equations(self, width: int, harmonic: bool, scaled: bool) -> dict[str, ca.SX]:

@@ -185,7 +185,7 @@ class Fetched(Future):
         return found
 
 class Here:
-    # Runs tasks at once, and gives their results on request.
+    # Runs tasks within submit, and returns their results on request.
     _max_workers = 1
 
     def submit(self, function, *arguments):
