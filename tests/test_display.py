@@ -343,6 +343,7 @@ def test_labels_of_a_plan_are_text(label):
     assert len(repr(step).splitlines()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", ["<b>", "a & b", '"', "$x$"])
 def test_labels_in_a_figure_are_text(label):
     read, plain = (Read(cp.PolySpline(PLANE, labels=[x, "z"])._repr_html_()) for x in (label, "x"))

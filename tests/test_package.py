@@ -110,6 +110,7 @@ def test_names_are_loaded_on_first_use():
     )
 
 
+@pytest.mark.slow
 def test_planning_works_where_control_is_not_installed():
     fresh(
         "import sys\n"

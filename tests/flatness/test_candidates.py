@@ -12,6 +12,7 @@ from flat_plants import CASES, car, cart, huygens, machine, pvtol, two_mass
 import ctrlplan as cp
 
 
+@pytest.mark.slow
 def test_candidates_of_a_car_and_of_a_machine():
     found = cp.flat_candidates(car, at={"v": 1.0})
     assert found[0] == cp.FlatCandidate(("x", "y"), (2, 2), 1)

@@ -177,6 +177,7 @@ def test_the_crane_from_its_equations_alone(rope_wrap):
         np.testing.assert_allclose(got, wanted, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_limits_on_states_and_inputs_of_a_derived_plant():
     flat = derived(CASES["two masses"])
     plan = rest_to_rest(["x2"], [5], [1.0])
@@ -214,6 +215,7 @@ AROUND = circle(2.0)
 TURNING = derived(CASES["car"])
 
 
+@pytest.mark.slow
 def test_the_branch_is_that_of_the_operating_point_or_the_start():
     """A car that drives the same circle backwards has the opposite heading and speed."""
     forwards, backwards = derived(CASES["car"]), cp.flat_system(car, ["x", "y"], at={"v": -1.0})
@@ -261,6 +263,7 @@ def test_plans_that_are_not_smooth_enough_are_rejected_where_they_jump():
         flat.states_and_inputs(rough, [-0.5, 0.5])
 
 
+@pytest.mark.slow
 def test_pickles_threads_and_copies():
     flat = derived(CASES["car"])
     again = pickle.loads(pickle.dumps(flat))
@@ -376,6 +379,7 @@ def one_input(update, states, name="plant"):
     return ct.nlsys(update, None, states=states, inputs=["u"], name=name)
 
 
+@pytest.mark.slow
 def test_inputs_that_enter_by_several_terms_are_found_for_any_demand():
     """x' = u + u^3, and x' = sin u on two of its branches."""
     plan = rest_to_rest(["x"], [3], [1e3], 1.0)
@@ -534,6 +538,7 @@ def test_angles_of_quantities_are_continuous_along_the_plan(count):
     np.testing.assert_allclose(flat.quantities(AROUND.jet(t[shuffled], 2))["v"], found["v"][shuffled], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_limits_of_an_angle_that_turns_are_rejected():
     flat = derived(CASES["unicycle"])
     with pytest.raises(ValueError, match=r"th must stay within half a turn .*, got 12\.57 rad"):

@@ -82,6 +82,7 @@ def test_unicycle_and_trailers_follow_the_equations():
         assert (still[0] == 0.0).all()
 
 
+@pytest.mark.slow
 def test_the_inputs_that_set_the_pace():
     assert CAR.pace_degrees == by_hand().pace_degrees == (1, 0)
     assert RATE.pace_degrees == (1, 1)
@@ -195,6 +196,7 @@ def test_maps_by_hand_that_are_finite_but_wrong_at_rest_are_rejected():
     assert (u[0] > 0.0).all()
 
 
+@pytest.mark.slow
 def test_derived_maps_at_rest_say_what_to_do():
     for plan in (LINE, LINE.then(LINE + cp.Step([4.0, 3.0], [4.0, 3.0]))):
         with pytest.raises(ValueError, match=r"states of car.* w1 is not .*at rest there, and a plan of a .*PathPlan"):

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("casadi")
 
 from flat_plants import CASES, ball, car, cart, pvtol, system, two_mass, unicycle
+from repetitions import one_in
 
 import ctrlplan as cp
 from ctrlplan import NotFlatError
@@ -21,8 +22,9 @@ def derived(case, plant=None, **options):
     return cp.flat_system(plant or case.plant, case.outputs, **{"at": case.at, **options})
 
 
-@pytest.mark.parametrize("case", FLAT.values(), ids=list(FLAT))
-def test_orders_and_extension(case):
+@pytest.mark.parametrize("name", one_in(3, FLAT))
+def test_orders_and_extension(name):
+    case = FLAT[name]
     flat = derived(case)
     assert (flat.orders, flat.extension) == (case.orders, case.extension)
     assert sum(flat.orders) == case.plant.nstates + flat.extension

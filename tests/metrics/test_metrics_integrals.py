@@ -65,6 +65,7 @@ records = st.lists(eighths, min_size=2, max_size=30).map(np.array)
 powers = st.integers(-20, 20).map(lambda i: 2.0**i)
 
 
+@pytest.mark.slow
 @given(records, powers, powers)
 def test_integrals_scale_with_amplitude_and_time(e, a, pace):
     t = np.arange(e.size) / 4
@@ -84,6 +85,7 @@ def test_integrals_scale_with_amplitude_and_time(e, a, pace):
     assert metrics.saturation_time(pace * t, a * e, -10 * a, 25 * a) == pytest.approx(pace * held, rel=1e-12)
 
 
+@pytest.mark.slow
 @given(records, st.integers(-1000, 1000))
 def test_integrals_do_not_mind_the_sign_or_the_date(e, delay):
     t = np.arange(e.size) / 4

@@ -205,6 +205,7 @@ def own(tmp_path_factory):
     return calls, differing, printed.getvalue()
 
 
+@pytest.mark.slow
 def test_calls_are_counted_and_one_that_differs_is_found(own):
     calls, differing, _ = own
     assert calls == {

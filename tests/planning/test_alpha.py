@@ -375,6 +375,7 @@ def test_waypoints_may_come_from_a_generator():
     assert cp.choose_alpha(w for w in OBSTACLE).alpha == cp.choose_alpha(OBSTACLE).alpha
 
 
+@pytest.mark.slow
 def test_piecewise_splines_have_an_alpha_too():
     found = cp.choose_alpha(OBSTACLE, "peak_jerk", family=cp.PiecewiseSpline)
     assert isinstance(found.plan, cp.PiecewiseSpline)

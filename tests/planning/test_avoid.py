@@ -75,6 +75,7 @@ def check(plan, found, obstacles, *, gap, load=0.0, crane=None, points=4):
         np.testing.assert_allclose(values[known], w.jet[known], rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 @EVERY_FAMILY
 def test_the_wall_of_the_paper_is_passed_without_its_via_points(family):
     plan = FAMILIES[family](PAPER)
@@ -156,6 +157,7 @@ WALLS = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", one_in(3, [2, 3, 4], first=1))
 def test_a_slalom_of_nine_walls(order):
     """The shortest polyline has 18 corners, and at a clearance of 0.2 a length of 42.80 m."""
@@ -219,6 +221,7 @@ def test_scenes_at_random_without_a_rope_are_all_solved(family):
     assert solved >= 2
 
 
+@pytest.mark.slow
 def test_waypoints_of_the_user_stay_with_all_entries():
     points = [ACROSS[0], cp.Waypoint(8.0, [10.0, 5.0], [2.0, 0.1]), ACROSS[1]]
     plan = cp.PolySpline(points, labels=["x", "z"])
@@ -278,6 +281,7 @@ RING = [Rectangle(x, z) for x in ((17.0, 18.0), (22.0, 23.0)) for z in ((2.0, 8.
 ]
 
 
+@pytest.mark.slow
 def test_a_goal_enclosed_is_said_with_how_near_a_plan_comes():
     """Whoever crosses a wall 1 m thick is 0.5 m deep in it somewhere, and a load of 0.3 m deeper."""
     with pytest.raises(
@@ -303,6 +307,7 @@ def test_a_gap_too_narrow_is_said_with_what_it_would_allow():
     assert 0.15 < best <= 0.2  # half of the gap of 1 m less the load
 
 
+@pytest.mark.slow
 def test_a_rope_has_no_way_under_what_reaches_above_the_trolley():
     plan = cp.PolySpline(rest([0.0, 9.0], [20.0, 9.0]))
     beam = Rectangle((8.0, 12.0), (-1.0, 3.0))

@@ -482,6 +482,7 @@ def test_a_late_start_does_not_change_the_time_law(start):
 # Quantities that samples do not see
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1e-2, 1e-3, 1e-4])
 def test_a_narrow_peak_of_a_quantity_sets_the_duration(width):
     """A load that grows about one place, in proportion to the speed there: its peak is that of u over the duration."""

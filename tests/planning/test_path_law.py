@@ -168,6 +168,7 @@ REST = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]
 MOVE, MOVE_ON = PolySpline(REST), PolySpline([Waypoint(0, 1, 0, 0), Waypoint(1, 2, 0, 0)])
 
 
+@pytest.mark.slow
 def test_a_dwell_keeps_its_duration():
     plan = MOVE.then(PolySpline([Waypoint(0, 1, 0, 0), Waypoint(2.5, 1, 0, 0)])).then(MOVE_ON)
     found = fastest(plan, {"velocity": 10.0, "acceleration": 1.0}, hold="path")

@@ -109,6 +109,7 @@ def test_bands_are_drawn_as_they_are(grid):
         np.testing.assert_allclose(reference.get_ydata(), REFERENCES[plan], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_bands_of_the_error_are_those_of_the_reference_less_the_output(grid):
     for axes, (plan, curves) in zip(grid[1], responses().items(), strict=True):
         expected = np.quantile(REFERENCES[plan] - curves, LEVELS, axis=0)
@@ -152,6 +153,7 @@ def test_the_legend_says_what_the_bands_hold(drawn):
     assert [text.get_text() for text in legend.get_texts()] == ["reference", "5 to 95 %", "25 to 75 %", "median"]
 
 
+@pytest.mark.slow
 def test_without_units_none_is_made_up(failed):
     labels = [axes.get_ylabel() for axes in failed.plot().axes.flat]
     assert {"y", "error of y"} <= set(labels)
@@ -237,6 +239,7 @@ def test_the_page_shows_bands_and_responses(page):
         assert caption.words() == figure.attributes["aria-label"]
 
 
+@pytest.mark.slow
 def test_the_page_says_what_was_drawn(page):
     (findings,) = (e for e in page.all("ul") if "21 draws" in e.words())
     assert "21 draws: tau 0.5 to 1.5" in findings.words()

@@ -162,6 +162,7 @@ def test_waypoints_given_in_part_are_not_marked():
     assert set(marked(plot_paths(replace(found, waypoints=tuple(free)), None))) == {"start", "B", "goal"}
 
 
+@pytest.mark.slow
 def test_figures_need_no_waypoints():
     found = replace(compared(MOVE), waypoints=())
     assert marked(plot_paths(found, None)) == {}

@@ -509,6 +509,7 @@ def test_a_sweep_is_drawn_as_it_is_and_broken_where_it_jumps(swept):
     assert ts[gap + 1] > ts[gap - 1] + 1.0
 
 
+@pytest.mark.slow
 def test_values_at_which_a_loop_never_settles_are_drawn_too():
     found = cp.sweep(cp.plants.integrator_lag_loop, [-2.0, -1.0, 1.0, 2.0], MOVE, TIMES, progress=False)
     settling, _ = axes_of(found.plot())

@@ -205,6 +205,7 @@ def legend(figure):
     return one.get_texts()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", one_in(2, [name for name in NOT_WRITTEN_SO if name not in ("emoji", "Chinese", "Arabic")])
 )
@@ -223,6 +224,7 @@ def test_an_empty_name_has_its_place_in_the_legend():
     assert [t.get_text() for t in legend(figure)] == ["", "other"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["emoji", *(pytest.param(name, marks=pytest.mark.slow) for name in CONTROL)])
 def test_letters_that_the_font_lacks_are_told_by_their_numbers(name):
     figure = plot_plans(named([TEXTS[name], TEXTS[name] + "!"])).figure

@@ -123,6 +123,7 @@ def test_a_table_of_ones_own_has_its_cells_and_marks(own, read):
     assert all(cell.attributes["scope"] == "row" for cell in body.all("th"))
 
 
+@pytest.mark.slow
 def test_data_of_a_section_is_in_the_results(own):
     data = json.loads(own[1].read_text(encoding="utf-8"))["studies"]["mine"]
     assert data["durations"] == {"longest": 1.0}
@@ -135,6 +136,7 @@ def test_a_section_may_stand_below_the_metrics(compared, read):
     assert heads(page) == ["Mine", "All metrics", "Durations & <limits>", "Parameters and versions"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_sections_of_one_type_have_ids_of_their_own(compared, read):
     two = tuple(Curves("a", "b", TIMES, {"c": k * TIMES}, caption=f"Number {k}.") for k in (1, 2))
@@ -208,6 +210,7 @@ def test_a_row_has_a_cell_for_each_heading():
 # Nothing is told apart by a name
 
 
+@pytest.mark.slow
 def test_reports_know_no_name_of_a_plan_and_no_study_of_the_paper():
     """Neither names of plans as constants, nor modules of the paper's studies."""
     names = {"step", "polynomial", "trigonometric", "piecewise", *PAPER}

@@ -125,6 +125,7 @@ def test_nothing_is_left_to_fill_in_and_nothing_is_undefined(html, page):
         assert cell.words() or "unit" in cell.attributes.get("class", "")
 
 
+@pytest.mark.slow
 def test_words_of_others_are_escaped(html):
     assert "The claim &lt;fails&gt;." in html
     assert "Length &amp; width" in html

@@ -226,6 +226,7 @@ def heavy_states(law, end):
     return tight(lambda t, x: both(t, x)[0], np.linspace(0.0, end, 7), [0, 0, 0, 0, *REST], BREAKS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("law", ["generator", "load_feedback"])
 def test_a_heavier_load_than_the_controller_knows(law, method):

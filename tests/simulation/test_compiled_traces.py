@@ -7,6 +7,7 @@ import control as ct
 import numpy as np
 import pytest
 from compiled_cases import T, tight
+from repetitions import one_in
 from scipy.special import expit
 
 import ctrlplan as cp
@@ -158,7 +159,7 @@ FUNCTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", one_in(3, FUNCTIONS))
 def test_functions_of_a_state(name):
     """x' = -f(x) through a kink, from 2."""
     function = FUNCTIONS[name]

@@ -44,6 +44,7 @@ def test_a_jump_that_arrives_at_an_instant_is_seen_by_its_sample(step, delay, me
     assert first_seen(late, t, cp.Step(1.0, time=step), method) == round(10 * (step + delay))
 
 
+@pytest.mark.slow
 @examples(30)
 @example(1 / 44100, 2999, 3600.0)
 @given(

@@ -14,6 +14,7 @@ from ctrlplan.simulation.moments import moment_states
 A, B = [[0.0, 1.0], [-4.0, -0.8]], [[0.2], [1.0]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [51, pytest.param(401, marks=pytest.mark.slow)])
 def test_many_segments(count):
     """80 segments of 13 ms, compared with power series in 50 digits; breakpoints and times are apart."""

@@ -191,6 +191,7 @@ def method_of_steps(t):
         return float(sum((-1) ** k * (mp.mpf(t) - mp.mpf(k + 1) / 2) ** (k + 1) / mp.factorial(k + 1) for k in terms))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["compiled", "python"])
 @pytest.mark.parametrize(("offset", "height"), [(0.0, 1.0), (1e4, 1e-3)])
 def test_a_delayed_signal_that_dies_away_takes_no_more_segments(method, offset, height, monkeypatch):

@@ -202,6 +202,7 @@ def test_unless_given_limits_are_what_the_polynomial_needs(stiff):
     assert stiff.limits == pytest.approx({"y_d1": 15 / 8, "y_d2": 10 / 3**0.5, "y_d3": 60.0}, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_an_axis_that_does_not_move_has_no_limit():
     points = [cp.Waypoint.from_jets(0, x=[0, 0, 0], z=[1, 0, 0]), cp.Waypoint.from_jets(2, x=[4, 0, 0], z=[1, 0, 0])]
     both = ct.append(ct.ss(loop(5.0)), ct.ss(loop(5.0)))
@@ -222,6 +223,7 @@ def test_the_quintic_takes_exactly_its_own_time(stiff):
     assert required(stiff)["quintic (minimum jerk)"].duration == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_s_curve_takes_its_closed_form(stiff):
     """Every limit is reached: d/v + v/a + a/j."""
     v, a, j = 15 / 8, 10 / 3**0.5, 60.0
@@ -247,6 +249,7 @@ def test_what_jumps_keeps_no_limit_and_says_why(stiff):
     assert found["trapezoid"].limit.startswith("limits of y_d3 require")
 
 
+@pytest.mark.slow
 def test_the_sentence_names_the_fastest_and_those_that_cannot(stiff):
     sentence = stiff.verdicts[0]
     assert sentence.startswith(
@@ -257,6 +260,7 @@ def test_the_sentence_names_the_fastest_and_those_that_cannot(stiff):
     assert "no duration satisfies them for step, trapezoid, shaped step." in sentence
 
 
+@pytest.mark.slow
 def test_limits_given_hold_all():
     """v = 1, a = 4: the trapezoid takes d/v + v/a, every spline max(peak_k/limit_k)^(1/k)."""
     limits = {"velocity": 1.0, "acceleration": 4.0}
@@ -344,6 +348,7 @@ def test_a_mode_can_be_given_and_none_is_guessed_where_there_is_none():
         assert not [name for name in plans if "shaped" in name]
 
 
+@pytest.mark.slow
 def test_the_mode_of_a_sampled_loop_is_that_of_its_continuous_one():
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
     dt = 0.2  # poles at exp(-0.1 ± 2j): the left half of the disc
@@ -585,6 +590,7 @@ def test_compare_asks_when_it_is_asked_to(stiff):
     assert "worth" not in compared.results()
 
 
+@pytest.mark.slow
 def test_compare_hands_on_what_it_was_given():
     plans = {"mine": cp.PolySpline(MOVE)}
     measures = {"last": cp.Measure("Last", "s", "run", lambda run: run.t[-1])}

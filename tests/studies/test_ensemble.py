@@ -101,6 +101,7 @@ def test_metrics_are_those_of_the_closed_form(found):
     np.testing.assert_allclose(ramp["settling_time"], 1 + tau * np.log(50 * greatest), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_bands_are_quantiles_of_the_closed_form(found):
     assert found.levels == LEVELS == (0.05, 0.25, 0.5, 0.75, 0.95)
     np.testing.assert_array_equal(found.timepts, TIMES)

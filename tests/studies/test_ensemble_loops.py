@@ -210,6 +210,7 @@ def test_a_loop_without_inputs_is_refused_as_in_a_comparison():
 # Loops that cannot be compiled
 
 
+@pytest.mark.slow
 def test_a_loop_that_only_python_runs_is_run_in_this_process(found):
     result = run(lag_by_python(), {"tau": LAGS["tau"][:4]})
     assert result.failures == ()
@@ -265,6 +266,7 @@ def test_a_discrete_loop_takes_parameters_too():
     np.testing.assert_allclose(result.bands["step"]["y"], np.quantile(curves, LEVELS, axis=0), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:block own .*run by control.input_output_response:UserWarning")  # it is
 def test_a_loop_that_only_python_control_runs_takes_parameters_too():
     class Own(ct.NonlinearIOSystem):

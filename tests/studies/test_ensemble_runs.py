@@ -60,6 +60,7 @@ def test_failures_are_the_same_wherever_they_are_found(exploded):
     same_bits(exploded, run(exploding(), exploded.params, Elsewhere(), initial_state=[1.0]))
 
 
+@pytest.mark.slow
 def test_a_few_draws_are_shared_out_too():
     elsewhere = Elsewhere()
     run(lag(), {"tau": np.linspace(0.5, 1.5, 8)}, elsewhere)
@@ -147,6 +148,7 @@ def test_blocks_are_called_no_more_for_more_draws():
 # Draws that fail
 
 
+@pytest.mark.slow
 def test_a_draw_that_fails_is_recorded_and_the_others_stand():
     tau = np.array([0.5, 0.6, 1.0, 1.5, 2.0])
     result = run(failing(ValueError("no such lag"), 0.9, 1.1, nominal=0.4), {"tau": tau})
@@ -172,6 +174,7 @@ def test_a_draw_that_explodes_is_recorded_and_the_others_stand(exploded):
     assert np.isnan(exploded.metrics["step"]["iae"]).tolist() == [False, False, True, False]
 
 
+@pytest.mark.slow
 def test_the_message_of_a_draw_that_explodes_says_where(exploded):
     assert exploded.failures[0].message.startswith("SolverError: the solver must reach 10 s, got to 2 s")
 
@@ -183,6 +186,7 @@ def test_the_first_draw_may_fail_as_any_other():
     np.testing.assert_allclose(result.metrics["step"]["settling_time"][1:], np.log(50) * tau[1:], rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("low", [0.1, 1.9], ids=["least", "greatest"])
 def test_the_least_and_greatest_draws_may_fail_as_any_other(low):
     tau = np.array([1.0, 0.5, 2.0, 1.2])
@@ -191,6 +195,7 @@ def test_the_least_and_greatest_draws_may_fail_as_any_other(low):
     assert np.isfinite(result.metrics["step"]["iae"]).sum() == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [IndexError("beyond"), KeyError("entry"), AssertionError("not so"), TypeError("it")])
 def test_a_draw_may_fail_in_any_way(error):
     result = run(failing(error, 0.9, 1.1, nominal=0.4), {"tau": [0.5, 1.0, 2.0]})

@@ -249,6 +249,7 @@ print(json.dumps(found))
 """
 
 
+@pytest.mark.slow
 def test_signals_keep_what_is_finished_in_this_process_and_in_threads(tmp_path):
     found = run(tmp_path, SIGNALS)
     for name, values in (

@@ -122,6 +122,7 @@ def test_a_step_is_a_set_point_of_the_law(stated):
     np.testing.assert_allclose(found.outputs["angle"], 2.0 + np.exp(np.outer(t, p)) @ c, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_lane_change_ends_with_its_plans(stated):
     found = stated(lane(units={"x": "m"})).run().comparison
     assert found.metrics["polynomial"]["overshoot_error"] < 1e-6
@@ -225,6 +226,7 @@ def loop() -> ct.InputOutputSystem:
 FROM_MODULE = {"kind": "python:own_plant:plant", "poles": [-8.0, -9.0]}
 
 
+@pytest.mark.slow
 def test_a_function_may_return_a_flat_system(stated):
     """Limits, sweeps and draws, and the same loop as by hand."""
     data = motor(

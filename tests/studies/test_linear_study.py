@@ -46,6 +46,7 @@ def test_compare_finds_the_table_to_four_digits(gain):
     np.testing.assert_allclose(row, TABLE[gain], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_study_is_the_one_of_the_paper(study):
     assert PAPER["linear"] is linear_study
     assert isinstance(study, Study)

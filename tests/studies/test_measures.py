@@ -428,6 +428,7 @@ def test_an_actuator_is_at_its_limit_and_does_not_leave_it():
     assert str(occurrence) == "0 s: u was at its limit"
 
 
+@pytest.mark.slow
 def test_many_loops_at_once_name_and_rank_as_one():
     """A sweep of linear loops takes the same names, metrics of the path, and signals that have no worst."""
     build = lambda k: ct.ss([], [], [], k * np.eye(2), inputs=["rx", "rt"], outputs=["x", "theta"])  # noqa: E731

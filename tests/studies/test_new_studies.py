@@ -173,6 +173,7 @@ def test_progress_says_what_runs(written, capsys):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_progress_counts_the_plans_on_a_terminal(written, capsys, monkeypatch):
     written("fastest")
@@ -185,6 +186,7 @@ def test_progress_counts_the_plans_on_a_terminal(written, capsys, monkeypatch):
     assert len({name for _, name in running}) == 3
 
 
+@pytest.mark.slow
 def test_a_bar_over_runs_has_none_over_their_plans(capsys):
     move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
     events = [cp.Event("y", high=2.0)]  # loops with events run one by one
@@ -199,6 +201,7 @@ def test_a_bar_over_runs_has_none_over_their_plans(capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_progress_names_sweeps(written, capsys):
     written("sweep")

@@ -129,6 +129,7 @@ def test_the_force_predicted_at_the_motion_of_the_load_is_that_of_the_simulation
     assert predicted[governor.DEPTH] > 10.0 * simulated[at]
 
 
+@pytest.mark.slow
 def test_the_states_of_the_model_have_the_load_motion_of_the_crane(governed):
     """Load position and velocity of the linear crane, x = D - D(0) + R theta, and the error of its trolley."""
     _, found, states = governed

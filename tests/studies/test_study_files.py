@@ -209,6 +209,7 @@ def test_choices_reach_the_plan(stated):
     np.testing.assert_array_equal(found["long"](np.arange(17.0)), expected(np.arange(17.0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", one_in(2, ["trigonometric", "piecewise"]))
 def test_alpha_can_be_left_to_be_chosen(family, stated):
     """The shortest path, of all that a scan finds; from then on alpha is a number."""

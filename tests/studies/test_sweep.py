@@ -196,7 +196,14 @@ def test_every_parameter_of_compare_is_among_the_choices():
     assert {entry.name for entry in dataclasses.fields(cp.Experiment)} <= known
 
 
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in CHOICES.items() for value in values])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        pytest.param(name, value, marks=[] if value is values[0] else pytest.mark.slow)
+        for name, values in CHOICES.items()
+        for value in values
+    ],
+)
 def test_an_option_means_and_is_checked_the_same_however_loops_are_run(name, value):
     """As in a comparison of each loop by itself."""
     values, times = np.array([2.0, 60.0]), np.linspace(0.0, 12.0, 31)

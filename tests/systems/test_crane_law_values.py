@@ -160,6 +160,7 @@ class Shifted(Law):
         return ct.nlsys(None, out, inputs=inner.input_labels, outputs=inner.output_labels, dt=None, name=self.name)
 
 
+@pytest.mark.slow
 def test_a_user_s_law_is_given_like_any_other():
     np.testing.assert_allclose(
         outputs(crane_loop(CRANE, plan(), Shifted())), outputs(crane_loop(CRANE, plan(), "generator")), atol=1e-7

@@ -114,6 +114,7 @@ def test_number_of_poles_is_stated():
             cp.create_flat_iosystem(flat, poles)
 
 
+@pytest.mark.slow
 def test_the_law_is_that_of_the_crane_written_by_hand():
     """From corresponding starts, tension m g at rest: the same controls along a plan, from an error."""
     plant, flat, plan, start, _, _ = crane_case()

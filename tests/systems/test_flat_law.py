@@ -315,6 +315,7 @@ def test_the_linearised_joint_loop_has_the_poles_at_every_angle(angle):
         assert np.abs(model(s)[0] - expected / polynomial.polyval(s, expected)).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_it_agrees_with_python_controls_own_simulation():
     plant = flexible_joint()
     plan = smooth(4)

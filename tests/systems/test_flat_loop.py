@@ -123,6 +123,7 @@ def test_riccati_law_returns_a_car_to_its_lane():
             cp.flat_loop(CAR, LANE, law=wrong)
 
 
+@pytest.mark.slow
 def test_riccati_gains_of_maps_by_formulas_are_those_of_the_equations():
     """The motor is linear: the stationary gain is that of its matrices."""
     R, L, K, J, b = 1.0, 0.5, 0.01, 0.01, 0.1
@@ -144,6 +145,7 @@ def test_after_the_end_the_stationary_gain_is_used():
     np.testing.assert_allclose(after, ct.lqr(a, b, np.eye(4), np.eye(1))[0], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_states_and_inputs_for_a_state_feedback_of_python_control():
     """The car with gains by python-control's create_statefbk_iosystem, from a start off the lane."""
     block = cp.create_flat_feedforward_iosystem(CAR)

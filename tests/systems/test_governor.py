@@ -84,6 +84,7 @@ def test_limits_hold_whatever_a_bounded_disturbance_does():
         assert found.states[1].min() < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_every_sample_takes_the_largest_fraction(seed):
     """The law, written out in the test, on states propagated from sample to sample by a matrix exponential."""
@@ -139,6 +140,7 @@ def test_what_is_not_admissible_waits_and_arrives():
     assert abs(y[-1] - 1.0) < 5e-3
 
 
+@pytest.mark.slow
 def test_compiled_and_python_agree():
     times = np.linspace(0.0, 2.0, 101)
     whole = lag_loop()

@@ -17,6 +17,7 @@ CAR, RATE = (cp.flat_system(plant, ["x", "y"], at={"v": 1.0}) for plant in (car,
 Q, R = np.diag([1.0, 1.0, 10.0]), np.eye(2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [pytest.param(CAR, id="angle"), pytest.param(RATE, id="rate", marks=pytest.mark.slow)])
 def test_inputs_alone_park_the_car_from_an_exact_start(flat):
     loop = cp.flat_loop(flat, PLAN, law=cp.Feedforward())
@@ -35,6 +36,7 @@ def test_the_steering_angle_may_jump_at_a_stop():
     assert abs(found.outputs["delta"][10]) > 0.4  # the value after the stop
 
 
+@pytest.mark.slow
 def test_states_and_inputs_as_a_source_for_a_state_feedback_of_python_control():
     block = cp.create_flat_feedforward_iosystem(CAR, plan=PLAN)
     assert block.input_labels == []

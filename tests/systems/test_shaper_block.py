@@ -177,6 +177,7 @@ def test_a_constant_command_is_reached_exactly(kind):
     assert (fed(block, commands, frequency)[-150:] == 0.1).all()
 
 
+@pytest.mark.slow
 def test_zv_cancels_the_phase_of_the_measured_frequency():
     """At each sample three weights, nonnegative, whose vectors with the phases of the past samples add to zero."""
     zeta = 0.08

@@ -223,6 +223,7 @@ def slowed():
     return plan, times, alone(plan, 4, times, u, bandwidth=5.0, fastest=1.4)
 
 
+@pytest.mark.slow
 def test_jets_are_those_of_the_plan_composed_with_the_time_scaling(slowed):
     """By sympy's derivatives of f(s(t)) to order 4, those of the plan in closed form and those of s by its lags."""
     _, _, found = slowed

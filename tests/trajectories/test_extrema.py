@@ -241,6 +241,7 @@ def test_narrow_peaks_of_smooth_functions(name, width):
         assert plan(found.time_min[0]) == pytest.approx(level, abs=1e-3 * width)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["polynomial", "trigonometric", "segments", "profile"])
 def test_pulses_longer_than_the_distance_of_the_samples(name):
     """A function that is 0 but for a part 1/2000 of the duration, and jumps at both ends of it."""

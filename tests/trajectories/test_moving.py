@@ -529,6 +529,7 @@ def test_an_axis_that_ends_early_must_end_at_rest():
     np.testing.assert_allclose(both.jet(both.end, 1)[:, 1], [0.0, 0.5], rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_without_the_extra():
     """Rest to rest with symmetric limits, stops and saved profiles work; what requires it says what to install."""
     saved = json.dumps(SCurve(3.0, velocity=1.0, acceleration=1.0, jerk=2.0, start_velocity=0.5).to_dict())

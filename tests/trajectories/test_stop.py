@@ -338,6 +338,7 @@ def test_no_law_of_the_same_kind_is_shorter_for_many_plans():
     assert np.median(check_paths(6, 6)) < 0.7
 
 
+@pytest.mark.slow
 def test_the_path_ends_first():
     """Shortly before the end the plan itself is the stop; with slower limits what follows the end is rest."""
     time = MOVE.end - 0.05
