@@ -41,6 +41,8 @@ from ctrlplan.trajectories.quadrature import gauss
 from ctrlplan.trajectories.waypoint import Entries, entry_name, waypoint_table
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
+from .chain import chain_least_squares
+
 _EPS = float(np.finfo(float).eps)
 _LIMITED_MEMORY = {"maxcor": 30, "gtol": 1e-7, "ftol": 1e-14, "maxiter": 10_000, "maxfun": 20_000}
 """Options of the minimisation over times."""
@@ -390,7 +392,10 @@ class _Segments:
     def solve(self, group: _Group, estimate: bool = False) -> _Solution:
         """Optimum of axes with the same pattern of prescribed entries."""
         filled = self._banded(group, estimate)
-        left, right, unique = self._dense(group) if filled is None else (filled, filled, True)
+        if filled is not None:
+            left, right, unique = filled, filled, True
+        else:
+            left, right, unique = self._chained(group) or self._dense(group)
         data = self._data(left, right)
         value, change = self.root @ data, self.root @ (data * self.orders[:, None])
         power = 1 - 2 * self.derivative
@@ -424,6 +429,18 @@ class _Segments:
         filled = group.rows.copy()
         filled.reshape(len(filled), -1)[:, group.pattern.places] = found
         return filled
+
+    def _chained(self, group: _Group) -> tuple[Array, Array, bool] | None:
+        """Entries to the left and to the right of all waypoints in linear time; None where they may not be unique."""
+        table, free = np.nan_to_num(group.rows).transpose(2, 1, 0), ~group.known
+        weight = self.durations ** (0.5 - self.derivative)
+        equations = self.root * (self.powers * weight).T[:, None, :]
+        right = -equations @ np.concatenate([table[:-1], table[1:]], axis=1)
+        found = chain_least_squares(equations, right, free & ~group.loose, free & group.loose)
+        if found is None:
+            return None
+        left, right = (np.where(free[:, :, None], side, table).transpose(2, 1, 0) for side in found)
+        return left, right, True
 
     def _dense(self, group: _Group) -> tuple[Array, Array, bool]:
         """Entries to the left and to the right of all waypoints by least squares, and whether they are unique."""
