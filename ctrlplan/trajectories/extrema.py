@@ -197,7 +197,8 @@ def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None
     if key in known.exact:
         t = places[key] * duration
     elif key in places:
-        t = _with_polished(jet, places[key] * duration, nu, duration)
+        t = places[key] * duration
+        t = _in_order(np.append(t, _polished(jet, t, nu, duration)), duration)
     else:
         t = stationary_times(jet, duration, nu)
         places[key] = t / duration
@@ -207,29 +208,27 @@ def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None
 
 def _search_together(plan: Trajectory, nu: int, places: Places | None, found: _Candidates) -> None:
     """Add the ends of all segments, and candidates at places in them; None: those of interpolants."""
-    breakpoints, durations = plan.breakpoints, np.diff(plan.breakpoints)
+    durations = np.diff(plan.breakpoints)
     every, lengths = np.tile(np.arange(durations.size), 2), np.append(np.zeros(durations.size), durations)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         if places is None:  # those of interpolants, whose places depend on the values at the ends
             values = plan.segments_jet(every, lengths, nu)[nu]
-            found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), values)
-            places = inner_extrema(plan, nu, values.min(axis=1), values.max(axis=1))
-            every, lengths = every[:0], lengths[:0]
-            if not places[1].size:
-                return
-        segments, s = places
-        if s.size:
-            slope, curve = plan.segments_jet(segments, s, nu + 2)[nu + 1 :]
-            moved = s - slope / curve  # as `_polished`
-            duration = durations[segments]
-            near = np.isfinite(moved) & (np.abs(moved - s) < 1e-6 * duration) & (moved >= 0.0) & (moved <= duration)
-            segments = np.concatenate([segments, *(segments[row] for row in near)])
-            s = np.concatenate([s, moved[near]])
-        values = plan.segments_jet(np.append(every, segments), np.append(lengths, s), nu)[nu]
-    if every.size:
-        found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), values[:, : every.size])
-    starts, ends = breakpoints[segments], breakpoints[segments + 1]
+            segments, s = _with_polished(plan, nu, *inner_extrema(plan, nu, values.min(axis=1), values.max(axis=1)))
+            values = np.append(values, plan.segments_jet(segments, s, nu)[nu], axis=1)
+        else:
+            segments, s = places
+            values = plan.segments_jet(np.append(every, segments), np.append(lengths, s), nu)[nu]
+    starts, ends = plan.breakpoints[segments], plan.breakpoints[segments + 1]
+    found.add_ends(np.append(plan.breakpoints[:-1], plan.breakpoints[1:]), values[:, : every.size])
     found.add(np.clip(starts + s, starts, np.nextafter(ends, starts)), values[:, every.size :])
+
+
+def _with_polished(plan: Trajectory, nu: int, segments: NDArray[np.intp], s: Array) -> Places:
+    """Places, and those after a Newton step; as `_polished`."""
+    slope, curve = plan.segments_jet(segments, s, nu + 2)[nu + 1 :]
+    moved, duration = s - slope / curve, np.diff(plan.breakpoints)[segments]
+    near = np.isfinite(moved) & (np.abs(moved - s) < 1e-6 * duration) & (moved >= 0.0) & (moved <= duration)
+    return np.concatenate([segments, *(segments[row] for row in near)]), np.concatenate([s, moved[near]])
 
 
 def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: int) -> Array:
@@ -252,13 +251,11 @@ def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: in
     times = [np.array([0.0, duration])]
     for left, right, slopes in _pieces(jet, 0.0, duration, nu + 1):
         times.append(0.5 * (left + right) + 0.5 * (right - left) * roots_of_rows(slopes)[1])
-    return _with_polished(jet, np.concatenate(times), nu, duration)
+    return _in_order(np.concatenate(times), duration)
 
 
-def _with_polished(jet: Callable[[Array, int], Array], t: Array, nu: int, duration: float) -> Array:
-    """Candidate times, increasing, with those after a Newton step."""
-    t = np.concatenate([t, _polished(jet, t, nu, duration)])
-    # Candidates within rounding of an end are that end.
+def _in_order(t: Array, duration: float) -> Array:
+    """Candidate times, increasing; those within rounding of an end are that end."""
     t[t < 1e-12 * duration] = 0.0
     t[t > (1.0 - 1e-12) * duration] = duration
     return np.unique(t)
