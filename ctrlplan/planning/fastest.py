@@ -30,6 +30,7 @@ from ctrlplan.planning.scalar_search import bisected, bottom, scan
 from ctrlplan.planning.time_law import with_fast_time_law
 from ctrlplan.trajectories import PathPlan, Retimed, Trajectory, WaypointSpline
 from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.extrema import search_extrema
 
 if TYPE_CHECKING:
     from control import ControlPlot
@@ -879,22 +880,23 @@ def _check_rest(plan: Trajectory, limited: Limited) -> None:
 def _closed_form(plan: Trajectory, limited: Limited, highest: float = math.inf) -> float:
     """Minimum duration for limits of derivatives up to an order, T_0 max_k (peak_k/limit_k)^(1/k)."""
     minimum, seen = 0.0, limited.seen(plan)
-    for bound in limited.bounds:
-        if bound.axis is not None and 0 < bound.order <= highest and bound.is_constant:
-            extrema = seen.extrema(bound.order)
-            sides = (
-                (float(extrema.maximum[bound.axis]), bound.high, float(extrema.time_max[bound.axis])),
-                (-float(extrema.minimum[bound.axis]), -bound.low, float(extrema.time_min[bound.axis])),
-            )
-            rounding = 1e-12 * max(abs(value) for value, _, _ in sides)
-            for value, side, time in sides:
-                if side > 0.0:
-                    minimum = max(minimum, plan.duration * (max(value, 0.0) / side) ** (1.0 / bound.order))
-                elif value > rounding:  # a sign that violates the limit at any duration
-                    raise ValueError(
-                        f"limits must be satisfied for some duration, got {bound.name} of both signs where it must be "
-                        f"{bound.range}: its sign at {time:.6g} s is the same at every duration"
-                    )
+    bounds = [b for b in limited.bounds if b.axis is not None and 0 < b.order <= highest and b.is_constant]
+    search_extrema(seen, {bound.order for bound in bounds})
+    for bound in bounds:
+        extrema = seen.extrema(bound.order)
+        sides = (
+            (float(extrema.maximum[bound.axis]), bound.high, float(extrema.time_max[bound.axis])),
+            (-float(extrema.minimum[bound.axis]), -bound.low, float(extrema.time_min[bound.axis])),
+        )
+        rounding = 1e-12 * max(abs(value) for value, _, _ in sides)
+        for value, side, time in sides:
+            if side > 0.0:
+                minimum = max(minimum, plan.duration * (max(value, 0.0) / side) ** (1.0 / bound.order))
+            elif value > rounding:  # a sign that violates the limit at any duration
+                raise ValueError(
+                    f"limits must be satisfied for some duration, got {bound.name} of both signs where it must be "
+                    f"{bound.range}: its sign at {time:.6g} s is the same at every duration"
+                )
     return minimum
 
 

@@ -30,7 +30,7 @@ from ctrlplan.planning.quantities import (
 from ctrlplan.planning.window import mean_square, window
 from ctrlplan.trajectories import PathPlan, Retimed, Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
-from ctrlplan.trajectories.extrema import Extrema, function_extrema
+from ctrlplan.trajectories.extrema import Extrema, function_extrema, search_extrema
 from ctrlplan.trajectories.trajectory import check_end
 
 if TYPE_CHECKING:
@@ -642,6 +642,7 @@ class Limited:
         """Margins of derivatives and quantities."""
         constant = [k for k in self._local if self.bounds[k].is_constant]
         derived = [self.bounds[k] for k in constant if self.bounds[k].axis is not None]
+        search_extrema(plan, {b.order for b in derived})
         extrema = {order: plan.extrema(order) for order in {b.order for b in derived}}
         for b in derived:
             yield _axis_margin(b, extrema[b.order])

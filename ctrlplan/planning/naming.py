@@ -94,14 +94,17 @@ class Naming:
                 continue
             if name in ENTRIES and find(name) is None and find != self._of_loop:
                 order = ENTRIES.index(name)
-                for axis, own in enumerate(_by_axis(name, limit, self.naxes or self.plan.naxes)):
+                rows = _by_axis(name, limit, self.naxes or self.plan.naxes)
+                for axis, own in enumerate(rows):
+                    if not axis or own is not rows[axis - 1]:  # the same limit of several axes is read once
+                        given = _read(name, own, True)
                     signal = Signal(derivative_name(self.plan.labels[axis], order), order, axis)
-                    yield from _of_signal(name, own, signal)
+                    yield from _of_signal(name, given, signal)
                 continue
             signal = self._known(name, find)
             several = isinstance(limit, list | tuple) and len(limit) and all(isinstance(own, Limits) for own in limit)
             for own in limit if several else [limit]:  # type: ignore[attr-defined]
-                yield from _of_signal(name, own, signal)
+                yield from _of_signal(name, _read(name, own, signal.axis is not None), signal)
 
     def _known(self, name: str, find: Callable[[str], Signal | None]) -> Signal:
         found = find(name)
@@ -125,9 +128,9 @@ class Naming:
 
     def _named(self, name: str) -> Signal | None:
         """Signal of a name: of the loop if there is one with that name."""
-        meant, unnamed = self._derivatives.get(name), self.plan.labels == default_labels(self.plan.naxes)
         if self.loop is None:
             return self._of_plan(name)
+        meant, unnamed = self._derivative(name), self.plan.labels == default_labels(self.plan.naxes)
         if name not in self.loop.names:  # such as y, the default label, with a loop whose output is y[0]
             return None if unnamed and meant is not None and not meant.order else self._of_plan(name)
         if meant is not None and not unnamed:
@@ -145,16 +148,23 @@ class Naming:
         return Signal(name, loop=True) if self.loop is not None and name in self.loop.names else None
 
     def _of_plan(self, name: str) -> Signal | None:
-        if name in self._derivatives:
-            return self._derivatives[name]
+        derivative = self._derivative(name)
+        if derivative is not None:
+            return derivative
         if name in ENTRIES:
             return None
         return Signal(name, self._orders[name]) if name in self._orders else None
 
+    def _derivative(self, name: str) -> Signal | None:
+        """Derivative of an axis of a name; None if it is not one."""
+        place = self._derivatives.get(name)
+        return None if place is None else Signal(name, *place)
+
     @cached_property
-    def _derivatives(self) -> dict[str, Signal]:
+    def _derivatives(self) -> dict[str, tuple[int, int]]:
+        """Orders and axes of derivatives by name."""
         return {
-            derivative_name(label, k): Signal(derivative_name(label, k), k, axis)
+            derivative_name(label, k): (k, axis)
             for k in range(_HIGHEST + 1)
             for axis, label in enumerate(self.plan.labels)
         }
@@ -164,13 +174,17 @@ class Naming:
         return {} if self.quantities is None else _orders(self.quantities, self.plan)
 
 
-def _of_signal(name: str, limit: object, signal: Signal) -> Iterator[Bound]:
-    """Bounds of one signal from its limits in any form."""
+def _read(name: str, limit: object, of_axis: bool) -> Limits:
+    """Limits of one signal in any form; messages about those of a derivative of an axis name the forms."""
     try:
-        given = Limits.of(limit, name)
+        return Limits.of(limit, name)
     except ValueError as error:
-        lone = signal.axis is not None and not isinstance(limit, Limits) and not is_listed(limit)
+        lone = of_axis and not isinstance(limit, Limits) and not is_listed(limit)
         raise ValueError(f"{error}{f'; {_FORMS}' if lone else ''}") from None
+
+
+def _of_signal(name: str, given: Limits, signal: Signal) -> Iterator[Bound]:
+    """Bounds of one signal from its limits."""
     for bound in given.bounds(signal.name, signal):
         moving = signal.axis is not None and signal.order and bound.kind == "value" and bound.is_constant
         if moving and not bound.low <= 0.0 <= bound.high:
@@ -178,13 +192,11 @@ def _of_signal(name: str, limit: object, signal: Signal) -> Iterator[Bound]:
                 f"limits of {name} must include 0, the value at rest, got from {bound.low:g} to {bound.high:g}; "
                 f"{_FORMS}"
             )
-        # The rate of a derivative is the next one, whose extrema are exact.
-        following = replace(signal, order=signal.order + 1)
-        yield (
-            replace(bound, terms=((following, 1.0),), kind="value")
-            if bound.kind == "rate" and signal.axis is not None
-            else bound
-        )
+        if bound.kind == "rate" and signal.axis is not None:  # that of a derivative is the next one, with exact extrema
+            following = replace(signal, order=signal.order + 1)
+            yield replace(bound, terms=((following, 1.0),), kind="value")
+        else:
+            yield bound
 
 
 def _by_axis(name: str, limit: object, naxes: int) -> list[object]:

@@ -67,15 +67,17 @@ def roots_of_rows(coefficients: Array) -> tuple[NDArray[np.intp], Array]:
     matters = size > 1e-15 * size.max(axis=1, keepdims=True)
     degree = np.where(matters.any(axis=1), size.shape[1] - 1 - matters[:, ::-1].argmax(axis=1), 0)
     rows, roots = [np.empty(0, dtype=np.intp)], [np.empty(0)]
-    for n in np.unique(degree[degree > 0]).tolist():
-        own = np.flatnonzero(degree == n)
+    for n in sorted(set(degree.tolist()) - {0}):
+        own = (degree == n).nonzero()[0]
         # Eigenvalues of the colleague matrices, whose last columns differ.
-        matrices = np.repeat(_colleague(n)[None], own.size, axis=0)
-        weights = np.where(np.arange(n) > 0, 1.0, np.sqrt(2.0)) if n > 1 else np.ones(1)
-        matrices[:, :, -1] -= (0.5 if n > 1 else 1.0) * weights * coefficients[own, :n] / coefficients[own, n, None]
-        found: NDArray[np.complex128] = np.linalg.eigvals(matrices).astype(complex)
-        near = (np.abs(found.imag) < 1e-3) & (np.abs(found.real) < 1.0 + 1e-6)
-        rows.append(own[np.nonzero(near)[0]])
+        matrices = np.empty((own.size, n, n))
+        matrices[:] = _colleague(n)
+        matrices[:, :, -1] -= _weights(n) * coefficients[own, :n] / coefficients[own, n, None]
+        found = np.linalg.eigvals(matrices)
+        near = np.abs(found.real) < 1.0 + 1e-6
+        if found.dtype.kind == "c":
+            near &= np.abs(found.imag) < 1e-3
+        rows.append(own[near.nonzero()[0]])
         roots.append(np.clip(found.real[near], -1.0, 1.0))
     return np.concatenate(rows), np.concatenate(roots)
 
@@ -114,6 +116,12 @@ def _colleague(degree: int) -> Array:
     off = np.full(degree - 1, 0.5)
     off[:1] = np.sqrt(0.5)
     return np.diag(off, 1) + np.diag(off, -1)
+
+
+@lru_cache(maxsize=64)
+def _weights(degree: int) -> Array:
+    """Weights of the coefficients in the last column of a colleague matrix."""
+    return readonly(0.5 * np.where(np.arange(degree) > 0, 1.0, np.sqrt(2.0)) if degree > 1 else np.ones(1))
 
 
 @lru_cache(maxsize=64)

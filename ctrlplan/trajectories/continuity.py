@@ -41,8 +41,7 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     at nonzero velocity jumps there. Differences below 1e-9 of a derivative's peak, or of the
     range of the position, are rounding, as are those that the rounding of late times explains.
     """
-    before = plan.jet(plan.breakpoints, order, left=True)
-    after = plan.jet(plan.breakpoints, order)
+    before, after = _sides(plan, order)
     size = after - before
     size[:, :, -1] = -before[:, :, -1]
     size[0, :, -1] = plan.final - before[0, :, -1]
@@ -69,6 +68,23 @@ _INSIDE = np.array([0.1, 0.3, 0.45, 0.65, 0.85])
 """Parts of a segment at which a plan is sampled."""
 
 
+def _sides(plan: Trajectory, order: int) -> tuple[Array, Array]:
+    """Jets (order + 1, naxes, nbreakpoints) before and after every breakpoint, those of all segments together."""
+    times = plan.breakpoints
+    count = times.size - 1
+    if count:
+        moments = np.append(np.zeros(count), times[1:] - times[:-1])
+        with np.errstate(all="ignore"):
+            found = plan.segments_jet(np.tile(np.arange(count), 2), moments, order)
+        if np.isfinite(found.sum()):  # otherwise beyond floating point: an error, or evaluated with care
+            before, after = np.zeros((2, order + 1, plan.naxes, count + 1))
+            before[0, :, 0] = plan.initial
+            before[:, :, 1:] = found[:, :, count:]
+            after[:, :, :-1], after[:, :, -1] = found[:, :, :count], found[:, :, -1]
+            return before, after
+    return plan.jet(times, order, left=True), plan.jet(times, order)
+
+
 def _by_rounding_of_times(plan: Trajectory, order: int) -> Array:
     """Differences (order + 1, naxes, nbreakpoints) between both sides if breakpoints are rounded."""
     sides = [plan.jet(plan.breakpoints, order + 1, left=left)[1:] for left in (True, False)]
@@ -77,11 +93,14 @@ def _by_rounding_of_times(plan: Trajectory, order: int) -> Array:
 
 def _slacks(samples: Array) -> Array:
     """Sizes of differences that are rounding (order + 1, naxes), for samples of the derivatives."""
-    return np.stack([_slack(k, rows.min(axis=-1), rows.max(axis=-1)) for k, rows in enumerate(samples)])
+    minimum, maximum = samples.min(axis=-1), samples.max(axis=-1)
+    found = _slack(1, minimum, maximum)
+    found[0] = _slack(0, minimum[0], maximum[0])
+    return found
 
 
 def _slack(order: int, minimum: Array, maximum: Array) -> Array:
-    """Size of a difference that is rounding, for the extrema of a derivative, shape (naxes,)."""
+    """Size of a difference that is rounding, for the extrema of a derivative, shape (..., naxes)."""
     peak = np.maximum(np.abs(minimum), np.abs(maximum))
     # Relative to the range: a distant origin of the positions hides no jump.
     found = 1e-9 * peak if order else 1e-9 * (maximum - minimum) + 8.0 * np.finfo(float).eps * peak

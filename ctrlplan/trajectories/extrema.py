@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, NoReturn
@@ -159,14 +159,35 @@ def carry_extrema(plan: Trajectory, moved: Trajectory, rate: float) -> None:
             known[nu] = Extrema(low, high, earliest, latest)
 
 
+def search_extrema(plan: Trajectory, orders: Iterable[int]) -> None:
+    """Search the extrema of several derivatives together, for `derivative_extrema`, if places of all segments are known.
+
+    All of them are evaluated at the stationary points of each.
+    """
+    known = _known(plan).extrema
+    missing = [nu for nu in orders if nu and nu not in known]
+    places = [] if plan.in_batches else [_stationary_places(plan, nu) for nu in missing]
+    found = [own for own in places if own is not None]
+    if missing and len(found) == len(missing):
+        segments, s = (np.concatenate(rows) for rows in zip(*found, strict=True))
+        values = _Candidates()
+        _add_at_places(plan, missing, (segments, s), values)
+        both = values.extrema()
+        columns = (both.minimum, both.maximum, both.time_min, both.time_max)
+        for nu, *rows in zip(missing, *(column.reshape(len(missing), -1) for column in columns), strict=True):
+            known[nu] = Extrema(*rows)
+
+
 def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     found = _Candidates()
     if nu == 0 or plan.breakpoints.size == 1:
         held = np.zeros((2, plan.naxes)) if nu else np.stack([plan.initial, plan.final])
         found.add(np.array([plan.start, plan.end]), held.T, (plan.start, plan.end))
     places = None if plan.in_batches else _stationary_places(plan, nu)
-    if plan.in_batches or places is not None:
-        _search_together(plan, nu, places, found)
+    if places is not None:
+        _add_at_places(plan, [nu], places, found)
+    elif plan.in_batches:
+        _search_together(plan, nu, found)
     else:
         for segment in range(plan.breakpoints.size - 1):
             _search(plan, nu, segment, found)
@@ -175,13 +196,13 @@ def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
 
 def _stationary_places(plan: Trajectory, nu: int) -> Places | None:
     """Stationary points of all segments, as `Trajectory.stationary_places`, or kept ones."""
-    known, durations = _known(plan).together, np.diff(plan.breakpoints)
+    known = _known(plan).together
     if nu in known:
         segments, shares = known[nu]
-        return segments, shares * durations[segments]
+        return segments, shares * (plan.breakpoints[1:] - plan.breakpoints[:-1])[segments]
     places = plan.stationary_places(nu)
     if places is not None:
-        known[nu] = (places[0], places[1] / durations[places[0]])
+        known[nu] = (places[0], places[1] / (plan.breakpoints[1:] - plan.breakpoints[:-1])[places[0]])
     return places
 
 
@@ -197,7 +218,8 @@ def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None
     if key in known.exact:
         t = places[key] * duration
     elif key in places:
-        t = _with_polished(jet, places[key] * duration, nu, duration)
+        t = places[key] * duration
+        t = _in_order(np.append(t, _polished(jet, t, nu, duration)), duration)
     else:
         t = stationary_times(jet, duration, nu)
         places[key] = t / duration
@@ -205,31 +227,38 @@ def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None
     found.add(times, jet(t, nu)[nu], ends)
 
 
-def _search_together(plan: Trajectory, nu: int, places: Places | None, found: _Candidates) -> None:
-    """Add the ends of all segments, and candidates at places in them; None: those of interpolants."""
-    breakpoints, durations = plan.breakpoints, np.diff(plan.breakpoints)
-    every, lengths = np.tile(np.arange(durations.size), 2), np.append(np.zeros(durations.size), durations)
+def _add_at_places(plan: Trajectory, orders: Sequence[int], places: Places, found: _Candidates) -> None:
+    """Add derivatives of some orders at the ends of all segments, and at places in them."""
+    (segments, s), times = places, plan.breakpoints
+    count = times.size - 1
+    every = np.concatenate([np.arange(count), np.arange(count), segments])
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        if places is None:  # those of interpolants, whose places depend on the values at the ends
-            values = plan.segments_jet(every, lengths, nu)[nu]
-            found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), values)
-            places = inner_extrema(plan, nu, values.min(axis=1), values.max(axis=1))
-            every, lengths = every[:0], lengths[:0]
-            if not places[1].size:
-                return
-        segments, s = places
-        if s.size:
-            slope, curve = plan.segments_jet(segments, s, nu + 2)[nu + 1 :]
-            moved = s - slope / curve  # as `_polished`
-            duration = durations[segments]
-            near = np.isfinite(moved) & (np.abs(moved - s) < 1e-6 * duration) & (moved >= 0.0) & (moved <= duration)
-            segments = np.concatenate([segments, *(segments[row] for row in near)])
-            s = np.concatenate([s, moved[near]])
-        values = plan.segments_jet(np.append(every, segments), np.append(lengths, s), nu)[nu]
-    if every.size:
-        found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), values[:, : every.size])
-    starts, ends = breakpoints[segments], breakpoints[segments + 1]
-    found.add(np.clip(starts + s, starts, np.nextafter(ends, starts)), values[:, every.size :])
+        jets = plan.segments_jet(every, np.concatenate([np.zeros(count), times[1:] - times[:-1], s]), max(orders))
+    values = (jets[orders[0]] if len(orders) == 1 else jets[orders]).reshape(-1, every.size)
+    starts, ends = times[segments], times[segments + 1]
+    found.add_ends(np.concatenate([times[:-1], times[1:]]), values[:, : 2 * count])
+    found.add_inner(np.minimum(starts + s, np.nextafter(ends, starts)), values[:, 2 * count :])
+
+
+def _search_together(plan: Trajectory, nu: int, found: _Candidates) -> None:
+    """Add the ends of all segments, and extrema of interpolants, whose places depend on the values at the ends."""
+    times, count = plan.breakpoints, plan.breakpoints.size - 1
+    every, lengths = np.tile(np.arange(count), 2), np.append(np.zeros(count), np.diff(times))
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        values = plan.segments_jet(every, lengths, nu)[nu]
+        found.add_ends(np.append(times[:-1], times[1:]), values)
+        segments, s = _with_polished(plan, nu, *inner_extrema(plan, nu, values.min(axis=1), values.max(axis=1)))
+        values = plan.segments_jet(segments, s, nu)[nu]
+    starts, ends = times[segments], times[segments + 1]
+    found.add_inner(np.clip(starts + s, starts, np.nextafter(ends, starts)), values)
+
+
+def _with_polished(plan: Trajectory, nu: int, segments: NDArray[np.intp], s: Array) -> Places:
+    """Places, and those after a Newton step; as `_polished`."""
+    slope, curve = plan.segments_jet(segments, s, nu + 2)[nu + 1 :]
+    moved, duration = s - slope / curve, np.diff(plan.breakpoints)[segments]
+    near = np.isfinite(moved) & (np.abs(moved - s) < 1e-6 * duration) & (moved >= 0.0) & (moved <= duration)
+    return np.concatenate([segments, *(segments[row] for row in near)]), np.concatenate([s, moved[near]])
 
 
 def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: int) -> Array:
@@ -252,13 +281,11 @@ def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: in
     times = [np.array([0.0, duration])]
     for left, right, slopes in _pieces(jet, 0.0, duration, nu + 1):
         times.append(0.5 * (left + right) + 0.5 * (right - left) * roots_of_rows(slopes)[1])
-    return _with_polished(jet, np.concatenate(times), nu, duration)
+    return _in_order(np.concatenate(times), duration)
 
 
-def _with_polished(jet: Callable[[Array, int], Array], t: Array, nu: int, duration: float) -> Array:
-    """Candidate times, increasing, with those after a Newton step."""
-    t = np.concatenate([t, _polished(jet, t, nu, duration)])
-    # Candidates within rounding of an end are that end.
+def _in_order(t: Array, duration: float) -> Array:
+    """Candidate times, increasing; those within rounding of an end are that end."""
     t[t < 1e-12 * duration] = 0.0
     t[t > (1.0 - 1e-12) * duration] = duration
     return np.unique(t)
@@ -601,20 +628,23 @@ class _Candidates:
         self.values.append(values)
         self.ends.append(np.ones(t.size))
 
+    def add_inner(self, t: Array, values: Array) -> None:
+        """Add values (naxes, ntime) between the ends of segments."""
+        self.times.append(t)
+        self.values.append(values)
+        self.ends.append(np.zeros(t.size))
+
     def extrema(self) -> Extrema:
+        """The extrema, up to rounding: preferably at an end, then the earliest."""
         t, values, ends = np.concatenate(self.times), np.concatenate(self.values, axis=1), np.concatenate(self.ends)
-        by_time = np.argsort(t, kind="stable")
-        t, values, ends = t[by_time], values[:, by_time], ends[by_time]
-        low, high = (self._first(sign * values, ends) for sign in (1.0, -1.0))
+        by_time = t.argsort(kind="stable")
+        t, values, rank = t[by_time], values[:, by_time], 1.0 + ends[by_time]
+        both = np.stack([values, -values])  # the minimum of each is sought
+        lowest = both.min(axis=2)
+        slack = _ROUNDING * np.abs(lowest).max(axis=0)
+        low, high = ((both <= (lowest + slack)[:, :, None]) * rank).argmax(axis=2)
         rows = np.arange(len(values))
         return Extrema(values[rows, low], values[rows, high], t[low], t[high])
-
-    @staticmethod
-    def _first(values: Array, ends: Array) -> NDArray[np.intp]:
-        """Index of the minimum of each row, up to rounding: preferably an end, then the earliest."""
-        slack = _ROUNDING * np.abs(values).max(axis=1, keepdims=True)
-        tied = values <= values.min(axis=1, keepdims=True) + slack
-        return np.argmax(tied * (1.0 + ends), axis=1)
 
 
 def _placed(plan: Trajectory, segment: int, t: Array) -> tuple[Array, tuple[float, float]]:

@@ -241,6 +241,10 @@ class NewtonSpline(WaypointSpline):
         self._place_ends(segment, s, 0, found)
         return found
 
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives of the only segment; as `Trajectory.segments_jet`."""
+        return self.segment_jet(0, s, order)
+
     def _jet(self, s: Array, order: int) -> Array:
         """Derivatives (order + 1, naxes, ntime) at times since the start."""
         u = s / self._duration

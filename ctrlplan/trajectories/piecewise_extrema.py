@@ -111,17 +111,11 @@ def stationary_places(groups: Iterable[Sequence[Polynomials]], durations: Array,
     segments, times = [np.empty(0, dtype=np.intp)], [np.empty(0)]
     for runs in groups:
         with np.errstate(all="ignore"):
-            bounds = [_bounds(run, durations[run.first : run.last], nu) for run in runs]
-        low, high, minimum, maximum = (np.concatenate(rows, axis=1) for rows in zip(*bounds, strict=True))
-        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            beyond = _beyond_ends(runs, durations, nu)
+        if beyond is None:
             return None
-        size = np.maximum(np.abs(minimum), np.abs(maximum)).max(axis=1, keepdims=True)
-        slack = _TIED * np.maximum(size, _TINY)
-        # Ties with other segments as well, of which the earliest counts, also of the same shape at other times.
-        above = (high > maximum) & (high >= maximum.max(axis=1, keepdims=True) - slack)
-        below = (low < minimum) & (low <= minimum.min(axis=1, keepdims=True) + slack)
         for run in runs:
-            axes, own = np.nonzero((above | below)[:, run.first : run.last])
+            axes, own = beyond[:, run.first : run.last].nonzero()
             if own.size:
                 series = _slope_series(run.basis, nu) @ run.coefficients[:, axes, own]
                 rows, roots = roots_of_rows(series.T)
@@ -129,6 +123,23 @@ def stationary_places(groups: Iterable[Sequence[Polynomials]], durations: Array,
                 times.append(0.5 + 0.5 * roots)
     chosen = np.concatenate(segments)
     return chosen, np.concatenate(times) * durations[chosen]
+
+
+def _beyond_ends(runs: Sequence[Polynomials], durations: Array, nu: int) -> NDArray[np.bool_] | None:
+    """Whether axes in segments (naxes, nsegments) may have extrema of the plan inside; None if bounds overflow."""
+    if durations.size == 1:  # its stationary points cost less than its bounds
+        sizes = np.abs(runs[0].coefficients).sum(axis=0) * durations**-nu
+        return np.ones(sizes.shape, dtype=bool) if np.isfinite(sizes).all() else None
+    bounds = [_bounds(run, durations[run.first : run.last], nu) for run in runs]
+    low, high, minimum, maximum = (np.concatenate(rows, axis=1) for rows in zip(*bounds, strict=True))
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return None
+    size = np.maximum(np.abs(minimum), np.abs(maximum)).max(axis=1, keepdims=True)
+    slack = _TIED * np.maximum(size, _TINY)
+    # Ties with other segments as well, of which the earliest counts, also of the same shape at other times.
+    above = (high > maximum) & (high >= maximum.max(axis=1, keepdims=True) - slack)
+    below = (low < minimum) & (low <= minimum.min(axis=1, keepdims=True) + slack)
+    return np.asarray(above | below)
 
 
 @lru_cache(maxsize=128)

@@ -5,10 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Self
 
+import numpy as np
+
 from ctrlplan._types import Data
 from ctrlplan.trajectories.newton_spline import NewtonSpline, SplineOptions, checked_degree
+from ctrlplan.trajectories.piecewise_extrema import Places, Polynomials, stationary_places
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
+
+_MODERATE = 12
+"""Number of coefficients up to which power series have enough digits for stationary points."""
 
 
 class PolySpline(NewtonSpline):
@@ -70,6 +76,13 @@ class PolySpline(NewtonSpline):
         chosen = SplineOptions(labels, None, *checked_degree(degree, smooth), warn=warn)
         self._fit(checked_waypoints(waypoints), 0.0, chosen)
         self._check_swing()
+
+    def stationary_places(self, nu: int) -> Places | None:
+        """Places of the stationary points at moderate degrees; as `Trajectory.stationary_places`."""
+        if any(system.size > _MODERATE for _, system, _ in self._parts):
+            return None
+        groups = ([Polynomials(system, 0, coefficients[:, :, None])] for _, system, coefficients in self._parts)
+        return stationary_places(groups, np.array([self._duration]), nu)
 
     @classmethod
     def from_dict(cls, data: Data) -> Self:
