@@ -44,7 +44,6 @@ from numpy.typing import NDArray
 from scipy.linalg import blas
 
 from ctrlplan._types import Value
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy, evenly, last_coefficients, unit_points
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
 from ctrlplan.trajectories.fields import Fields
@@ -57,7 +56,7 @@ from ctrlplan.trajectories.one_time import (
     trigonometric_series,
 )
 from ctrlplan.trajectories.quadrature import gauss
-from ctrlplan.trajectories.sampling import in_products, products_of_values
+from ctrlplan.trajectories.sampling import collocation
 
 _MEET = 0.25
 """The ends coincide if their distance on the circle is below this fraction of that to all neighbours."""
@@ -79,9 +78,6 @@ MAXIMUM_LOSS = 1e-6
 
 _MAXIMUM_DIGITS = 100
 """Maximum number of constraints for decimal arithmetic, which then takes a fraction of a second."""
-
-_RESOLVED = 3e-14
-"""Size of the last coefficients of an interpolant relative to its mean, below which others do not matter."""
 
 _STORED = 64
 """Number of constraints up to which their order is stored for other times."""
@@ -417,43 +413,23 @@ class NewtonSystem(Fields):
             out[:, self.size - 1] += self._fold * out[:, self.size]
         return out[:, : self.size]
 
-    def interpolant(self, low: int, high: int) -> Array | None:
+    def interpolant(self, low: int, high: int) -> Array:
         """Interpolants (high - low + 1, size, nterms) of derivatives of the basis on the unit interval.
 
-        By the products of `sampling`; None where they are not resolved.
+        By the products of `sampling`, whose span contains the functions and their derivatives.
         """
         if (low, high) not in self._interpolants:
-            found = self._new_interpolant(low, high)
-            self._interpolants[low, high] = None if found is None else readonly(found)
+            points, products = collocation(effective(self.alpha), self.size)
+            values = self.taylor_between(points, high)
+            for order in range(2, high + 1):
+                values[order] *= math.factorial(order)
+            self._interpolants[low, high] = readonly(values[low:] @ products)
         return self._interpolants[low, high]
 
     @cached_property
-    def _interpolants(self) -> dict[tuple[int, int], Array | None]:
+    def _interpolants(self) -> dict[tuple[int, int], Array]:
         """Interpolants by lowest and highest order."""
         return {}
-
-    def _new_interpolant(self, low: int, high: int) -> Array | None:
-        """As `interpolant`, from values at Chebyshev points."""
-        # A polynomial is its own interpolant; other functions have more terms. An even number of points avoids the
-        # middle of the interval, where a waypoint often is.
-        terms = self.size + math.ceil(self.alpha and 10.0 + self.alpha * (2.3 + 0.18 * self.size))
-        count = terms + terms % 2
-        values = self.taylor_between(unit_points(count - 1), high)
-        for order in range(2, high + 1):
-            values[order] *= math.factorial(order)
-        values = values[low:]
-        if not self.alpha:
-            return values @ products_of_values(count, terms)
-        last = np.abs(values @ last_coefficients(count))
-        means = np.abs(values) @ evenly(count)
-        if (np.maximum(last[..., 0], last[..., 1]) <= _RESOLVED * means).all():
-            return values @ products_of_values(count, count)
-
-        def jet(u: Array, order: int) -> Array:
-            return self.taylor(u, order).transpose(1, 0, 2) * FACTORIALS[: order + 1, None, None]
-
-        found = chebyshev_proxy(jet, (0.0, 1.0), low, high)
-        return None if found is None else in_products(found)
 
     def series(self, coefficients: Array, u: Value, order: int) -> list[list[Value]]:
         """Taylor series of each axis at one normalised time, a number or a symbol."""

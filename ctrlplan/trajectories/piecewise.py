@@ -18,7 +18,7 @@ from ctrlplan.trajectories.chosen import checked_alpha, chosen_alpha
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton_spline import NewtonSpline
-from ctrlplan.trajectories.one_time import derivatives, is_moderate
+from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
 from ctrlplan.trajectories.pieces import Pieces, Run, scales
 from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
 from ctrlplan.trajectories.piecewise_fit import Frame
@@ -490,7 +490,7 @@ class PiecewiseSpline(WaypointSpline):
     def _sample_inside(self, t: Array, is_sorted: bool, low: int, high: int, left: bool) -> tuple[Array, bool]:
         """Derivatives low to high at times of the plan, and whether they are certainly finite."""
         times = self.breakpoints
-        if t.size > FEW and all([pieces.is_resolved(low, high) for pieces in self._pieces]):
+        if t.size > FEW:
             out = np.empty((high - low + 1, self.naxes, t.size))
             entries = self._filled[:, low : high + 1].transpose(2, 1, 0)
 
@@ -501,7 +501,7 @@ class PiecewiseSpline(WaypointSpline):
                 rows, finite = self._known_rows(low, high)
                 return (rows if segments.size == len(rows) else rows[segments]), finite
 
-            return out, sample_segments(times, rows_of, entries, t, is_sorted, left, out)
+            return out, sample_segments(times, rows_of, entries, t, is_sorted, left, effective(self.alpha), out)
         segments = times[1:-1].searchsorted(t, side="left" if left else "right")
         touched = int(np.count_nonzero(segments[1:] != segments[:-1])) + 1
         if touched <= _FEW:
