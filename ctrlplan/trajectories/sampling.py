@@ -61,7 +61,6 @@ _CHUNK = 4104  # the functions stay in the second cache; no power of two, to avo
 _SPARSE = 48  # number of times per segment from which a matrix product for each segment is faster
 _COMPARED = 18  # number of breakpoints up to which comparisons with each are faster than searches
 _BLOCK = 16 * _CHUNK  # number of times that are grouped together
-_LARGEST = 2.0**20  # bound of all functions of the bases
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,8 +281,8 @@ def place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
 
 
 def are_finite(coefficients: Array) -> bool:
-    """Whether coefficients exclude values that are not finite."""
-    return math.isfinite(_LARGEST * float(np.add.reduce(np.abs(coefficients), axis=None)))
+    """Whether coefficients exclude values that are not finite: none has a square beyond floating point."""
+    return math.isfinite(np.vdot(coefficients, coefficients))
 
 
 def in_products(coefficients: Array) -> Array:
