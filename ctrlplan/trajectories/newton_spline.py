@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
+from ctrlplan.trajectories.common import Array, are_finite, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, shared_system
 from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
@@ -345,7 +345,8 @@ def _solved(system: NewtonSystem, data: Array, times: list[float], duration: flo
     """Coefficients from prescribed derivatives (nconstraints, naxes)."""
     with np.errstate(over="ignore", invalid="ignore"):
         found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
-    if not np.isfinite(found).all():
+        is_finite = are_finite(found) or bool(np.isfinite(found).all())
+    if not is_finite:
         raise ValueError(
             "coefficients must stay within floating point, got an overflow from "
             f"waypoint entries of up to {np.abs(data).max():g} over {duration:g} s"

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.trajectories.chebyshev import transform, unit_points
-from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, are_finite, readonly
 
 if TYPE_CHECKING:
     from ctrlplan.trajectories.trajectory import Trajectory
@@ -278,11 +278,6 @@ def place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
     """Replace the lowest derivatives at some times by those that are known, (ntimes, k, naxes)."""
     rows, place = known.transpose(1, 2, 0), out[: known.shape[1]]
     place[:, :, where] = np.where(np.isnan(rows), place[:, :, where], rows) if np.isnan(known).any() else rows
-
-
-def are_finite(coefficients: Array) -> bool:
-    """Whether coefficients exclude values that are not finite: none has a square beyond floating point."""
-    return math.isfinite(np.vdot(coefficients, coefficients))
 
 
 def in_products(coefficients: Array) -> Array:
