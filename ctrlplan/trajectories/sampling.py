@@ -31,6 +31,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -49,7 +50,7 @@ FEW = 256
 _CELLS = 30_000
 """Number of sorted times from which cells are faster than an interpolant with many terms."""
 
-_CELLS_OR_SHORT = 300_000
+MANY = 300_000
 """Number of sorted times from which cells are faster than an interpolant with few terms."""
 
 _SHORT = 24
@@ -88,6 +89,24 @@ class Interpolant:
         return cls(readonly(rows), are_finite(rows), alpha)
 
 
+class Arrangement(Enum):
+    """Order of times.
+
+    Evenly spaced ones are so up to rounding, and increase strictly.
+    """
+
+    ANY = auto()
+    SORTED = auto()
+    EVEN = auto()
+
+    @classmethod
+    def of(cls, t: Array, duration: float) -> Arrangement:
+        """Arrangement of times of a segment with a duration."""
+        if _is_uniform(t, duration):
+            return cls.EVEN
+        return cls.SORTED if t[-1] > t[0] and _is_sorted(t) else cls.ANY
+
+
 class Part(NamedTuple):
     """Consecutive times of one segment.
 
@@ -115,6 +134,7 @@ def sample(
     t: Array,
     orders: tuple[int, int],
     out: Array,
+    arrangement: Arrangement | None = None,
 ) -> bool:
     """Derivatives at many times; whether they are certainly finite.
 
@@ -132,9 +152,11 @@ def sample(
         Lowest and highest order of the derivatives.
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
+    arrangement : Arrangement, optional
+        Of the times, if it is known.
     """
-    if interpolant is None or t.size > (_CELLS if interpolant.rows.shape[1] > _SHORT else _CELLS_OR_SHORT):
-        finite = _sample_cells(jet, duration, t, orders, out)
+    if interpolant is None or t.size > (_CELLS if interpolant.rows.shape[1] > _SHORT else MANY):
+        finite = _sample_cells(jet, duration, t, orders, out, arrangement or Arrangement.of(t, duration))
         if finite is not None:
             return finite
     if interpolant is None:
@@ -438,15 +460,19 @@ def _products_of_chebyshev(size: int) -> Array:
 
 
 def _sample_cells(
-    jet: Callable[[Array, int], Array], duration: float, t: Array, orders: tuple[int, int], out: Array
+    jet: Callable[[Array, int], Array],
+    duration: float,
+    t: Array,
+    orders: tuple[int, int],
+    out: Array,
+    arrangement: Arrangement,
 ) -> bool | None:
     """As `sample`, at sorted times by Taylor series in cells; None if times are not sorted, or series too long."""
-    low, high = orders
-    is_uniform = _is_uniform(t, duration)
-    if not is_uniform and not (t[-1] > t[0] and _is_sorted(t)):
+    if arrangement is Arrangement.ANY:
         return None
+    low, high = orders
     size = np.abs(jet(np.linspace(0.0, duration, 9), high + _MAX_TERMS + 2)).max(axis=2)
-    if is_uniform:
+    if arrangement is Arrangement.EVEN:
         step = float(t[-1] - t[0]) / (t.size - 1)
         for cell in (2048, 1024, 512, 256, 128, 64):
             terms = _taylor_terms(size, 0.5 * cell * step, low, high)
@@ -481,10 +507,10 @@ def sample_in_batches(plan: Trajectory, t: Array, low: int, high: int, left: boo
 
 
 def _is_uniform(t: Array, duration: float) -> bool:
-    """Whether the times are evenly spaced up to rounding of times within the segment."""
+    """Whether the times are evenly spaced up to rounding of times within the segment, and increase."""
     step = (t[-1] - t[0]) / (t.size - 1)
     slack = 4.0 * np.finfo(float).eps * duration
-    if not step > 0.0 or abs(t[1] - t[0] - step) > slack:
+    if not step > 2.0 * slack or abs(t[1] - t[0] - step) > slack:
         return False
     ramp = step * np.arange(min(t.size, 2 * _CHUNK))
     beyond = np.empty_like(ramp)
@@ -492,9 +518,14 @@ def _is_uniform(t: Array, duration: float) -> bool:
         part = t[first : first + ramp.size]
         excess = np.subtract(part, ramp[: part.size], out=beyond[: part.size])
         base = t[0] + first * step
-        if excess.max() - base > slack or base - excess.min() > slack:
+        if not (excess.max() - base <= slack and base - excess.min() <= slack):
             return False
     return True
+
+
+def is_increasing(arrangement: Arrangement | None) -> bool:
+    """Whether times are known to be sorted."""
+    return arrangement in (Arrangement.SORTED, Arrangement.EVEN)
 
 
 def _is_sorted(t: Array) -> bool:
