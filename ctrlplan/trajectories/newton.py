@@ -186,7 +186,10 @@ class NewtonSystem(Fields):
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
         )
-        collocation = self._collocation(beyond, pattern)
+        if not effective(alpha) and apart is None and size == count and pattern.places is not None:
+            collocation = _products_at_nodes(beyond, pattern.apart, pattern.places, max(pattern.keys))
+        else:
+            collocation = self._collocation(beyond, pattern)
         spread = None
         if not pattern.hermite or size > count:
             roughness = self.squared_samples(smooth) if size > count else None
@@ -572,6 +575,37 @@ class NewtonSystem(Fields):
         return (FACTORIALS[order] * np.sqrt(weights) * self.taylor(nodes, order)[:, order]).T
 
 
+def _products_at_nodes(beyond: Array, apart: NDArray[np.bool_], places: NDArray[np.intp], order: int) -> Array:
+    """Collocation of polynomials: each product without its factors that are 0, by elementary symmetric sums.
+
+    With the ratios 1/(x - x_i) of its other factors, the coefficient k of such a
+    product is its value times their sum of order k, and each factor that is 0 moves
+    the coefficients up an order.
+
+    Parameters
+    ----------
+    beyond : ndarray, shape (nwaypoints, size)
+        Distances of the waypoints to the nodes.
+    apart, places
+        As of `_Pattern`.
+    order : int
+        Highest coefficient.
+    """
+    factors = np.where(apart, beyond, 1.0)
+    ratio = apart / factors
+    sums = np.zeros((max(order, 1) + 1, len(beyond), beyond.shape[1] + 1))
+    value = sums[0]
+    value[:, 0] = 1.0
+    np.multiply.accumulate(factors, axis=1, out=value[:, 1:])
+    terms = ratio
+    for k in range(1, order + 1):
+        np.add.accumulate(terms, axis=1, out=sums[k, :, 1:])
+        if k < order:
+            terms = ratio * sums[k, :, :-1]
+    sums[1:] *= value
+    return np.asarray(sums.ravel().take(places).T)
+
+
 def _change_to_cosines(sums: Array, cosine: Array, ratio: Array, half: float) -> None:
     """Include the cosine of each odd function in its value and sums, and the powers of cosines in all sums.
 
@@ -725,6 +759,11 @@ class _Pattern(NamedTuple):
         Number of constraints of ends that coincide.
     is_short : int
         Number of waypoints if they are few and begin with their positions, else 0.
+    apart : ndarray of bool, shape (nwaypoints, nconstraints)
+        Whether a node is not at a waypoint.
+    places : ndarray of int, shape (nconstraints, nconstraints), or None
+        Place in the sums of `_products_at_nodes` of each function, by constraint; None for many constraints or
+        high orders.
     """
 
     at: tuple[int, ...]
@@ -736,6 +775,8 @@ class _Pattern(NamedTuple):
     hermite: bool
     lead: int
     is_short: int
+    apart: NDArray[np.bool_]
+    places: NDArray[np.intp] | None
 
 
 def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> _Pattern:
@@ -745,12 +786,25 @@ def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet:
     at, keys = (tuple(column) for column in zip(*pairs, strict=True))
     orders = np.array(keys, dtype=np.intp)
     waypoints, positions = np.array(at, dtype=np.intp), (orders == 0).astype(float)[:, None]
-    for array in (orders, waypoints, positions):
+    apart = np.arange(len(given))[:, None] != waypoints
+    for array in (orders, waypoints, positions, apart):
         array.flags.writeable = False
     hermite = all([own == tuple(range(len(own))) for own in given])
     number = len(set(at))
     is_short = number if 2 <= number <= _SHORT and keys[:number] == (0,) * number else 0
-    return _Pattern(at, keys, waypoints, orders, positions, int((orders == 0).argmax()), hermite, len(first), is_short)
+    anchor = int((orders == 0).argmax())
+    places = _places(apart, orders, waypoints) if len(at) <= _STORED and max(keys) <= _ELEMENTARY else None
+    return _Pattern(at, keys, waypoints, orders, positions, anchor, hermite, len(first), is_short, apart, places)
+
+
+def _places(apart: NDArray[np.bool_], orders: NDArray[np.intp], waypoints: NDArray[np.intp]) -> NDArray[np.intp]:
+    """As of `_Pattern`; coefficients below the number of factors that are 0 are 0, as the first sum of order 1 is."""
+    nwaypoints, count = apart.shape
+    zeros = np.zeros((nwaypoints, count), dtype=np.intp)
+    zeros[:, 1:] = np.cumsum(~apart[:, :-1], axis=1)
+    left = orders - zeros.T[:, waypoints]
+    found = (left * nwaypoints + waypoints) * (count + 1) + np.arange(count)[:, None]
+    return readonly(np.where(left >= 0, found, nwaypoints * (count + 1)))
 
 
 @lru_cache(maxsize=256)
