@@ -99,18 +99,6 @@ def transform(values: Array) -> Array:
 
 
 @lru_cache(maxsize=64)
-def last_coefficients(count: int) -> Array:
-    """Matrix (count, 2) from values at `points` to the last two coefficients."""
-    return readonly(_matrix(count - 1)[:, -2:].copy())
-
-
-@lru_cache(maxsize=64)
-def evenly(count: int) -> Array:
-    """Weights (count,) of a mean."""
-    return readonly(np.full(count, 1.0 / count))
-
-
-@lru_cache(maxsize=64)
 def _colleague(degree: int) -> Array:
     """Symmetric colleague matrix of the Chebyshev polynomial of a degree."""
     off = np.full(degree - 1, 0.5)

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+_FEW = 1000
+"""Number of values up to which their squares are summed in one call."""
+
 FACTORIALS: Array = np.array([float(math.factorial(k)) for k in range(171)])
 FACTORIALS.flags.writeable = False
 
@@ -20,6 +23,13 @@ def readonly(values: Array) -> Array:
     """Same array, made read-only."""
     values.flags.writeable = False
     return values
+
+
+def are_finite(values: Array) -> bool:
+    """Whether values certainly are finite: also their sum, whatever their signs."""
+    if values.size <= _FEW:  # for more, a product may run in several threads
+        return math.isfinite(np.vdot(values, values))
+    return math.isfinite(np.add.reduce(np.abs(values), axis=None))
 
 
 def times_powers(values: Array, base: float, orders: NDArray[np.integer[Any]]) -> Array:

@@ -44,7 +44,6 @@ from numpy.typing import NDArray
 from scipy.linalg import blas
 
 from ctrlplan._types import Value
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy, evenly, last_coefficients, unit_points
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
 from ctrlplan.trajectories.fields import Fields
@@ -57,7 +56,7 @@ from ctrlplan.trajectories.one_time import (
     trigonometric_series,
 )
 from ctrlplan.trajectories.quadrature import gauss
-from ctrlplan.trajectories.sampling import in_products, products_of_values
+from ctrlplan.trajectories.sampling import collocation
 
 _MEET = 0.25
 """The ends coincide if their distance on the circle is below this fraction of that to all neighbours."""
@@ -79,9 +78,6 @@ MAXIMUM_LOSS = 1e-6
 
 _MAXIMUM_DIGITS = 100
 """Maximum number of constraints for decimal arithmetic, which then takes a fraction of a second."""
-
-_RESOLVED = 3e-14
-"""Size of the last coefficients of an interpolant relative to its mean, below which others do not matter."""
 
 _STORED = 64
 """Number of constraints up to which their order is stored for other times."""
@@ -190,7 +186,10 @@ class NewtonSystem(Fields):
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
         )
-        collocation = self._collocation(beyond, pattern)
+        if not effective(alpha) and apart is None and size == count and pattern.places is not None:
+            collocation = _products_at_nodes(beyond, pattern.apart, pattern.places, max(pattern.keys))
+        else:
+            collocation = self._collocation(beyond, pattern)
         spread = None
         if not pattern.hermite or size > count:
             roughness = self.squared_samples(smooth) if size > count else None
@@ -417,43 +416,23 @@ class NewtonSystem(Fields):
             out[:, self.size - 1] += self._fold * out[:, self.size]
         return out[:, : self.size]
 
-    def interpolant(self, low: int, high: int) -> Array | None:
+    def interpolant(self, low: int, high: int) -> Array:
         """Interpolants (high - low + 1, size, nterms) of derivatives of the basis on the unit interval.
 
-        By the products of `sampling`; None where they are not resolved.
+        By the products of `sampling`, whose span contains the functions and their derivatives.
         """
         if (low, high) not in self._interpolants:
-            found = self._new_interpolant(low, high)
-            self._interpolants[low, high] = None if found is None else readonly(found)
+            points, products = collocation(effective(self.alpha), self.size)
+            values = self.taylor_between(points, high)
+            for order in range(2, high + 1):
+                values[order] *= math.factorial(order)
+            self._interpolants[low, high] = readonly(values[low:] @ products)
         return self._interpolants[low, high]
 
     @cached_property
-    def _interpolants(self) -> dict[tuple[int, int], Array | None]:
+    def _interpolants(self) -> dict[tuple[int, int], Array]:
         """Interpolants by lowest and highest order."""
         return {}
-
-    def _new_interpolant(self, low: int, high: int) -> Array | None:
-        """As `interpolant`, from values at Chebyshev points."""
-        # A polynomial is its own interpolant; other functions have more terms. An even number of points avoids the
-        # middle of the interval, where a waypoint often is.
-        terms = self.size + math.ceil(self.alpha and 10.0 + self.alpha * (2.3 + 0.18 * self.size))
-        count = terms + terms % 2
-        values = self.taylor_between(unit_points(count - 1), high)
-        for order in range(2, high + 1):
-            values[order] *= math.factorial(order)
-        values = values[low:]
-        if not self.alpha:
-            return values @ products_of_values(count, terms)
-        last = np.abs(values @ last_coefficients(count))
-        means = np.abs(values) @ evenly(count)
-        if (np.maximum(last[..., 0], last[..., 1]) <= _RESOLVED * means).all():
-            return values @ products_of_values(count, count)
-
-        def jet(u: Array, order: int) -> Array:
-            return self.taylor(u, order).transpose(1, 0, 2) * FACTORIALS[: order + 1, None, None]
-
-        found = chebyshev_proxy(jet, (0.0, 1.0), low, high)
-        return None if found is None else in_products(found)
 
     def series(self, coefficients: Array, u: Value, order: int) -> list[list[Value]]:
         """Taylor series of each axis at one normalised time, a number or a symbol."""
@@ -594,6 +573,37 @@ class NewtonSystem(Fields):
         exact = max(self.size - order, 1)
         nodes, weights = gauss(2 * self.size + int(4.0 * self.alpha) + 8 if self.alpha else exact)
         return (FACTORIALS[order] * np.sqrt(weights) * self.taylor(nodes, order)[:, order]).T
+
+
+def _products_at_nodes(beyond: Array, apart: NDArray[np.bool_], places: NDArray[np.intp], order: int) -> Array:
+    """Collocation of polynomials: each product without its factors that are 0, by elementary symmetric sums.
+
+    With the ratios 1/(x - x_i) of its other factors, the coefficient k of such a
+    product is its value times their sum of order k, and each factor that is 0 moves
+    the coefficients up an order.
+
+    Parameters
+    ----------
+    beyond : ndarray, shape (nwaypoints, size)
+        Distances of the waypoints to the nodes.
+    apart, places
+        As of `_Pattern`.
+    order : int
+        Highest coefficient.
+    """
+    factors = np.where(apart, beyond, 1.0)
+    ratio = apart / factors
+    sums = np.zeros((max(order, 1) + 1, len(beyond), beyond.shape[1] + 1))
+    value = sums[0]
+    value[:, 0] = 1.0
+    np.multiply.accumulate(factors, axis=1, out=value[:, 1:])
+    terms = ratio
+    for k in range(1, order + 1):
+        np.add.accumulate(terms, axis=1, out=sums[k, :, 1:])
+        if k < order:
+            terms = ratio * sums[k, :, :-1]
+    sums[1:] *= value
+    return np.asarray(sums.ravel().take(places).T)
 
 
 def _change_to_cosines(sums: Array, cosine: Array, ratio: Array, half: float) -> None:
@@ -749,6 +759,11 @@ class _Pattern(NamedTuple):
         Number of constraints of ends that coincide.
     is_short : int
         Number of waypoints if they are few and begin with their positions, else 0.
+    apart : ndarray of bool, shape (nwaypoints, nconstraints)
+        Whether a node is not at a waypoint.
+    places : ndarray of int, shape (nconstraints, nconstraints), or None
+        Place in the sums of `_products_at_nodes` of each function, by constraint; None for many constraints or
+        high orders.
     """
 
     at: tuple[int, ...]
@@ -760,6 +775,8 @@ class _Pattern(NamedTuple):
     hermite: bool
     lead: int
     is_short: int
+    apart: NDArray[np.bool_]
+    places: NDArray[np.intp] | None
 
 
 def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> _Pattern:
@@ -769,12 +786,25 @@ def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet:
     at, keys = (tuple(column) for column in zip(*pairs, strict=True))
     orders = np.array(keys, dtype=np.intp)
     waypoints, positions = np.array(at, dtype=np.intp), (orders == 0).astype(float)[:, None]
-    for array in (orders, waypoints, positions):
+    apart = np.arange(len(given))[:, None] != waypoints
+    for array in (orders, waypoints, positions, apart):
         array.flags.writeable = False
     hermite = all([own == tuple(range(len(own))) for own in given])
     number = len(set(at))
     is_short = number if 2 <= number <= _SHORT and keys[:number] == (0,) * number else 0
-    return _Pattern(at, keys, waypoints, orders, positions, int((orders == 0).argmax()), hermite, len(first), is_short)
+    anchor = int((orders == 0).argmax())
+    places = _places(apart, orders, waypoints) if len(at) <= _STORED and max(keys) <= _ELEMENTARY else None
+    return _Pattern(at, keys, waypoints, orders, positions, anchor, hermite, len(first), is_short, apart, places)
+
+
+def _places(apart: NDArray[np.bool_], orders: NDArray[np.intp], waypoints: NDArray[np.intp]) -> NDArray[np.intp]:
+    """As of `_Pattern`; coefficients below the number of factors that are 0 are 0, as the first sum of order 1 is."""
+    nwaypoints, count = apart.shape
+    zeros = np.zeros((nwaypoints, count), dtype=np.intp)
+    zeros[:, 1:] = np.cumsum(~apart[:, :-1], axis=1)
+    left = orders - zeros.T[:, waypoints]
+    found = (left * nwaypoints + waypoints) * (count + 1) + np.arange(count)[:, None]
+    return readonly(np.where(left >= 0, found, nwaypoints * (count + 1)))
 
 
 @lru_cache(maxsize=256)

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
+from ctrlplan.trajectories.common import Array, are_finite, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, shared_system
-from ctrlplan.trajectories.one_time import derivatives, is_moderate
+from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
 from ctrlplan.trajectories.sampling import Interpolant
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing, within
 from ctrlplan.trajectories.waypoint import Waypoint
@@ -260,19 +260,14 @@ class NewtonSpline(WaypointSpline):
         return out
 
     def _new_interpolant(self, segment: int, low: int, high: int) -> Interpolant | None:
-        found = []
-        for axes, system, coefficients in self._parts:
-            basis = system.interpolant(low, high)
-            if basis is None:
-                return super()._new_interpolant(segment, low, high)
-            found.append((axes, coefficients.T @ basis))
+        found = [(axes, coefficients.T @ system.interpolant(low, high)) for axes, system, coefficients in self._parts]
         rows = found[0][1]
         if len(found) > 1:
             rows = np.zeros((high - low + 1, self.naxes, max([own.shape[2] for _, own in found])))
             for axes, own in found:
                 rows[:, list(axes), : own.shape[2]] = own
         powers = np.array([[[self._duration**-k]] for k in range(low, high + 1)])
-        return Interpolant.of(rows * powers)
+        return Interpolant.of(rows * powers, effective(self.alpha))
 
     def _end_jet(self, segment: int, s: float, order: int) -> Array:
         # What a waypoint prescribes is not computed.
@@ -354,7 +349,8 @@ def _solved(system: NewtonSystem, data: Array, times: list[float], duration: flo
     """Coefficients from prescribed derivatives (nconstraints, naxes)."""
     with np.errstate(over="ignore", invalid="ignore"):
         found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
-    if not np.isfinite(found).all():
+        is_finite = are_finite(found) or bool(np.isfinite(found).all())
+    if not is_finite:
         raise ValueError(
             "coefficients must stay within floating point, got an overflow from "
             f"waypoint entries of up to {np.abs(data).max():g} over {duration:g} s"

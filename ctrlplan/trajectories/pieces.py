@@ -102,20 +102,12 @@ class Pieces(Fields):
         run = self.runs[0] if len(self.runs) == 1 else self.run(segment)
         return run.system.series_at(run.coefficients[:, :, segment - run.first].T.tolist(), u, order)
 
-    def is_resolved(self, low: int, high: int) -> bool:
-        """Whether derivatives of all segments have interpolants."""
-        return all([run.system.interpolant(low, high) is not None for run in self.runs])
-
     def rows(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
-        """Coefficients (nsegments, high - low + 1, naxes, nterms) of interpolants by relative time, if resolved.
+        """Coefficients (nsegments, high - low + 1, naxes, nterms) of interpolants by relative time.
 
         Numbers of segments must increase.
         """
-        found = []
-        for run in self.runs:
-            basis = run.system.interpolant(low, high)
-            if basis is not None:
-                found.append((run, basis))
+        found = [(run, run.system.interpolant(low, high)) for run in self.runs]
         if len(found) == 1:
             return _rows(*found[0], segments)
         out = np.zeros((segments.size, high - low + 1, len(self.axes), max(basis.shape[2] for _, basis in found)))

@@ -15,15 +15,15 @@ from ctrlplan._display import number
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.chosen import checked_alpha, chosen_alpha
-from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
+from ctrlplan.trajectories.common import Array, are_finite, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton_spline import NewtonSpline
-from ctrlplan.trajectories.one_time import derivatives, is_moderate
+from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
 from ctrlplan.trajectories.pieces import Pieces, Run, scales
 from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
 from ctrlplan.trajectories.piecewise_fit import Frame
 from ctrlplan.trajectories.polynomial import PolySpline
-from ctrlplan.trajectories.sampling import FEW, are_finite, place_entries, sample_segments
+from ctrlplan.trajectories.sampling import FEW, place_entries, sample_segments
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
 from ctrlplan.trajectories.waypoint import Entries, Waypoint
@@ -394,6 +394,7 @@ class PiecewiseSpline(WaypointSpline):
         positions = self._entries.rows[:, 0]
         lowest, highest = np.minimum.reduce(positions, axis=1), np.maximum.reduce(positions, axis=1)
         allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (highest - lowest)
+        limits = allowed.tolist()
         for pieces in self._pieces:
             axes = list(pieces.axes)
             for run in pieces.runs:
@@ -403,10 +404,12 @@ class PiecewiseSpline(WaypointSpline):
                 if not weights.size:
                     continue
                 sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
-                near = (weights @ sizes).reshape(len(axes), -1) <= allowed[axes, None]
-                if near.all():
+                bounds = (weights @ sizes).reshape(len(axes), -1)
+                highest_bounds = np.maximum.reduce(bounds, axis=1).tolist()
+                if all([bound <= limits[axis] for axis, bound in zip(axes, highest_bounds, strict=True)]):
                     continue
-                low, high = _range(run, np.flatnonzero(~near.all(axis=0)))
+                near = (bounds <= allowed[axes, None]).all(axis=0)
+                low, high = _range(run, np.flatnonzero(~near))
                 if not ((low >= (lowest - allowed)[axes]) & (high <= (highest + allowed)[axes])).all():
                     return False
         return True
@@ -490,7 +493,7 @@ class PiecewiseSpline(WaypointSpline):
     def _sample_inside(self, t: Array, is_sorted: bool, low: int, high: int, left: bool) -> tuple[Array, bool]:
         """Derivatives low to high at times of the plan, and whether they are certainly finite."""
         times = self.breakpoints
-        if t.size > FEW and all([pieces.is_resolved(low, high) for pieces in self._pieces]):
+        if t.size > FEW:
             out = np.empty((high - low + 1, self.naxes, t.size))
             entries = self._filled[:, low : high + 1].transpose(2, 1, 0)
 
@@ -501,7 +504,7 @@ class PiecewiseSpline(WaypointSpline):
                 rows, finite = self._known_rows(low, high)
                 return (rows if segments.size == len(rows) else rows[segments]), finite
 
-            return out, sample_segments(times, rows_of, entries, t, is_sorted, left, out)
+            return out, sample_segments(times, rows_of, entries, t, is_sorted, left, effective(self.alpha), out)
         segments = times[1:-1].searchsorted(t, side="left" if left else "right")
         touched = int(np.count_nonzero(segments[1:] != segments[:-1])) + 1
         if touched <= _FEW:

@@ -11,6 +11,14 @@ number, so that one multiplication per function and time is required. By
 :math:`V_{m+n} = V_m V_n - V_{m-n}` the coefficients of one basis are sums of few
 coefficients of the other.
 
+Trigonometric polynomials of degree m on an arc of alpha radians have the same form,
+exactly and with 2m + 1 functions: with the angle w from the middle of the arc,
+
+.. math:: x = 2\,\frac{\sin(w/2)}{\sin(\alpha/4)}, \qquad V_{2k}(x), \quad \cos(w/2)\,V_{2k+1}(x)
+
+as even ones are polynomials in cos w, and odd ones are sin w times those. These
+functions are well conditioned for every alpha; at alpha = 0 they are Chebyshev's.
+
 Very many sorted times are divided into cells. In each cell the Taylor series about
 its centre, from the exact jet there, gives the values: by one matrix product for all
 cells if the times are evenly spaced, otherwise by one per cell. All are as accurate
@@ -23,14 +31,15 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.trajectories.chebyshev import transform
-from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
+from ctrlplan.trajectories.chebyshev import transform, unit_points
+from ctrlplan.trajectories.common import FACTORIALS, Array, are_finite, readonly
 
 if TYPE_CHECKING:
     from ctrlplan.trajectories.trajectory import Trajectory
@@ -41,8 +50,11 @@ FEW = 256
 _CELLS = 30_000
 """Number of sorted times from which cells are faster than an interpolant with many terms."""
 
-_SHORT = 14
-"""Number of terms of an interpolant that is faster than cells."""
+MANY = 300_000
+"""Number of sorted times from which cells are faster than an interpolant with few terms."""
+
+_SHORT = 24
+"""Number of terms that are few."""
 
 _MAX_TERMS = 24
 _PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
@@ -50,7 +62,6 @@ _CHUNK = 4104  # the functions stay in the second cache; no power of two, to avo
 _SPARSE = 48  # number of times per segment from which a matrix product for each segment is faster
 _COMPARED = 18  # number of breakpoints up to which comparisons with each are faster than searches
 _BLOCK = 16 * _CHUNK  # number of times that are grouped together
-_LARGEST = 2.0**20  # bound of all functions of the bases
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,16 +74,37 @@ class Interpolant:
         Coefficients of the products of Chebyshev polynomials.
     is_finite : bool
         Whether all values on the segment are finite.
+    alpha : float
+        Angle [rad] of the segment of trigonometric polynomials; 0 of polynomials.
     """
 
     rows: Array
     is_finite: bool
+    alpha: float
 
     @classmethod
-    def of(cls, coefficients: Array) -> Interpolant:
+    def of(cls, coefficients: Array, alpha: float = 0.0) -> Interpolant:
         """Interpolants from coefficients of products (norders, naxes, size)."""
         rows = coefficients.reshape(-1, coefficients.shape[2])
-        return cls(readonly(rows), are_finite(rows))
+        return cls(readonly(rows), are_finite(rows), alpha)
+
+
+class Arrangement(Enum):
+    """Order of times.
+
+    Evenly spaced ones are so up to rounding, and increase strictly.
+    """
+
+    ANY = auto()
+    SORTED = auto()
+    EVEN = auto()
+
+    @classmethod
+    def of(cls, t: Array, duration: float) -> Arrangement:
+        """Arrangement of times of a segment with a duration."""
+        if _is_uniform(t, duration):
+            return cls.EVEN
+        return cls.SORTED if t[-1] > t[0] and _is_sorted(t) else cls.ANY
 
 
 class Part(NamedTuple):
@@ -102,6 +134,7 @@ def sample(
     t: Array,
     orders: tuple[int, int],
     out: Array,
+    arrangement: Arrangement | None = None,
 ) -> bool:
     """Derivatives at many times; whether they are certainly finite.
 
@@ -119,15 +152,17 @@ def sample(
         Lowest and highest order of the derivatives.
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
+    arrangement : Arrangement, optional
+        Of the times, if it is known.
     """
-    if interpolant is None or t.size > (_CELLS if interpolant.rows.shape[1] > _SHORT else 10 * _CELLS):
-        finite = _sample_cells(jet, duration, t, orders, out)
+    if interpolant is None or t.size > (_CELLS if interpolant.rows.shape[1] > _SHORT else MANY):
+        finite = _sample_cells(jet, duration, t, orders, out, arrangement or Arrangement.of(t, duration))
         if finite is not None:
             return finite
     if interpolant is None:
         _sample_chunks(jet, t, orders, out)
         return False
-    evaluate([Part(interpolant.rows, 0, t.size, 0.0, duration)], t, out)
+    evaluate([Part(interpolant.rows, 0, t.size, 0.0, duration)], t, out, interpolant.alpha)
     return interpolant.is_finite
 
 
@@ -138,6 +173,7 @@ def sample_segments(
     t: Array,
     is_sorted: bool,
     left: bool,
+    alpha: float,
     out: Array,
 ) -> bool:
     """Derivatives at many times of several segments, by interpolants; whether they are certainly finite.
@@ -158,6 +194,8 @@ def sample_segments(
         Whether no time is below the one before.
     left : bool
         Whether breakpoints belong to the segment that ends there.
+    alpha : float
+        As of `Interpolant`.
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
     """
@@ -165,14 +203,14 @@ def sample_segments(
     for begin in range(0, t.size, _BLOCK):
         part, place = t[begin : begin + _BLOCK], out[:, :, begin : begin + _BLOCK]
         if is_sorted:
-            finite &= _sample_sorted_block(times, rows_of, entries, part, left, place)
+            finite &= _sample_sorted_block(times, rows_of, entries, part, left, alpha, place)
         else:
             segments = _segments_of_unsorted(times, part, left)
             order = segments.argsort(kind="stable")
             counts = np.bincount(segments)
             used = counts.nonzero()[0]
             found = np.empty(place.shape)
-            finite &= _sample_grouped(times, rows_of, entries, part[order], left, used, counts[used], found)
+            finite &= _sample_grouped(times, rows_of, entries, part[order], left, alpha, used, counts[used], found)
             back = np.empty_like(order)
             back[order] = np.arange(order.size)
             for values, target in zip(found.reshape(-1, part.size), out.reshape(-1, t.size), strict=True):
@@ -202,6 +240,7 @@ def _sample_sorted_block(
     entries: Array,
     t: Array,
     left: bool,
+    alpha: float,
     out: Array,
 ) -> bool:
     """As `sample_segments`, at sorted times."""
@@ -214,13 +253,12 @@ def _sample_sorted_block(
     if t.size < _SPARSE * (last + 1 - first):
         counts = bounds[1:] - bounds[:-1]
         used = counts.nonzero()[0]
-        return _sample_grouped(times, rows_of, entries, t, left, used + first, counts[used], out)
+        return _sample_grouped(times, rows_of, entries, t, left, alpha, used + first, counts[used], out)
     rows, finite = rows_of(np.arange(first, last + 1))
     ends, starts = bounds.tolist(), moments.tolist()
     spans = zip(rows, ends, ends[1:], starts, starts[1:], strict=False)
-    evaluate(
-        [Part(own, begin, end, start, stop - start) for own, begin, end, start, stop in spans if begin < end], t, out
-    )
+    parts = [Part(own, begin, end, start, stop - start) for own, begin, end, start, stop in spans if begin < end]
+    evaluate(parts, t, out, alpha)
     if equal:
         where, at = np.array(equal).T
         place_entries(entries[at], where, out)
@@ -233,6 +271,7 @@ def _sample_grouped(
     entries: Array,
     t: Array,
     left: bool,
+    alpha: float,
     segments: NDArray[np.intp],
     counts: NDArray[np.intp],
     out: Array,
@@ -243,10 +282,10 @@ def _sample_grouped(
     durations = ends - starts
     if t.size < _SPARSE * segments.size:
         index = np.arange(segments.size).repeat(counts)
-        _evaluate_each(rows, index, t - starts[index], durations[index], out)
+        _evaluate_each(rows, index, t - starts[index], durations[index], out, alpha)
     else:
         bounds = [0, *counts.cumsum().tolist()]
-        evaluate(list(map(Part, rows, bounds, bounds[1:], starts.tolist(), durations.tolist())), t, out)
+        evaluate(list(map(Part, rows, bounds, bounds[1:], starts.tolist(), durations.tolist())), t, out, alpha)
     where = (t == (ends if left else starts).repeat(counts)).nonzero()[0]
     at = segments.repeat(counts)[where] + left
     if segments[-1] == times.size - 2 and not left:  # the end belongs to the last segment
@@ -263,23 +302,46 @@ def place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
     place[:, :, where] = np.where(np.isnan(rows), place[:, :, where], rows) if np.isnan(known).any() else rows
 
 
-def are_finite(coefficients: Array) -> bool:
-    """Whether coefficients exclude values that are not finite."""
-    return math.isfinite(_LARGEST * float(np.add.reduce(np.abs(coefficients), axis=None)))
-
-
 def in_products(coefficients: Array) -> Array:
     """Coefficients of products from Chebyshev coefficients (..., size)."""
     return np.asarray(coefficients @ _products_of_chebyshev(coefficients.shape[-1]))
 
 
-@lru_cache(maxsize=64)
-def products_of_values(count: int, terms: int) -> Array:
-    """Matrix (count, terms) from values at Chebyshev points to the coefficients of the first products."""
-    return readonly(in_products(transform(np.eye(count))[:, :terms]))
+class Collocation(NamedTuple):
+    """Points from which functions are interpolated.
+
+    Attributes
+    ----------
+    points : ndarray, shape (count,)
+        Relative times in the segment.
+    products : ndarray, shape (count, terms)
+        Matrix from values there to the coefficients of products.
+    """
+
+    points: Array
+    products: Array
 
 
-def evaluate(parts: Sequence[Part], t: Array, out: Array) -> None:
+@lru_cache(maxsize=256)
+def collocation(alpha: float, size: int) -> Collocation:
+    """Points for polynomials of `size` coefficients, or for trigonometric polynomials of degree size // 2.
+
+    Their number is even, so that the middle of the segment, where a waypoint often is,
+    is none of them.
+    """
+    terms = size // 2 * 2 + 1 if alpha else size
+    count = terms + terms % 2
+    nodes = 2.0 * unit_points(count - 1) - 1.0
+    products = in_products(transform(np.eye(count))[:, :terms])
+    if not alpha:
+        return Collocation(unit_points(count - 1), readonly(products))
+    angles = np.arcsin(math.sin(0.25 * alpha) * nodes)  # half of those from the middle
+    weights = 1.0 / np.cos(angles)[:, None]  # odd functions are divided by the cosine, which leaves polynomials
+    products = 0.5 * (products + products[::-1] + weights * products - weights * products[::-1])
+    return Collocation(readonly(0.5 + (2.0 / alpha) * angles), readonly(products))
+
+
+def evaluate(parts: Sequence[Part], t: Array, out: Array, alpha: float = 0.0) -> None:
     """Values of interpolants.
 
     Parameters
@@ -290,10 +352,11 @@ def evaluate(parts: Sequence[Part], t: Array, out: Array) -> None:
         Times [s].
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
+    alpha : float
+        As of `Interpolant`.
     """
     target = out.reshape(-1, t.size)  # a view
-    basis = np.empty((max([2, *[part.rows.shape[1] for part in parts]]), min(_CHUNK, t.size)))
-    basis[0] = 1.0
+    basis = _new_basis(max([part.rows.shape[1] for part in parts]), t.size, alpha)
     place = 0
     for begin in range(0, t.size, _CHUNK):
         end = min(begin + _CHUNK, t.size)
@@ -302,12 +365,12 @@ def evaluate(parts: Sequence[Part], t: Array, out: Array) -> None:
         while place < len(parts) and parts[place].first < end:
             rows, first, last, start, duration = parts[place]
             low, high = max(first, begin), min(last, end)
-            _scale(t[low:high], start, 0.25 * duration, functions[1, low - begin : high - begin])
+            _scale(t[low:high], start, duration, alpha, functions[1, low - begin : high - begin])
             inside.append((rows, low, high))
             if last > end:
                 break
             place += 1
-        _fill(functions)
+        _fill(functions, alpha)
         for rows, first, last in inside:
             step = max(1, _PRODUCT // rows.size)
             for low in range(first, last, step):
@@ -315,7 +378,7 @@ def evaluate(parts: Sequence[Part], t: Array, out: Array) -> None:
                 np.matmul(rows, functions[: rows.shape[1], low - begin : high - begin], out=target[:, low:high])
 
 
-def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Array, out: Array) -> None:
+def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Array, out: Array, alpha: float) -> None:
     """As `evaluate`, each time with its own rows, for few times of many segments.
 
     Parameters
@@ -326,35 +389,59 @@ def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Arr
         Place of the rows of each time among them.
     """
     target = out.reshape(-1, t.size)  # a view
-    basis = np.empty((max(rows.shape[2], 2), min(_CHUNK, t.size)))
-    basis[0] = 1.0
+    basis = _new_basis(rows.shape[2], t.size, alpha)
     for begin in range(0, t.size, _CHUNK):
         end = min(begin + _CHUNK, t.size)
         functions = basis[:, : end - begin]
-        _scale(t[begin:end], 0.0, 0.25 * duration[begin:end], functions[1])
-        _fill(functions)
+        _scale(t[begin:end], 0.0, duration[begin:end], alpha, functions[1])
+        _fill(functions, alpha)
         used = functions[: rows.shape[2]].T[:, :, None]
         target[:, begin:end] = (rows[index[begin:end]] @ used)[:, :, 0].T
 
 
-def _scale(t: Array, start: float, quarter: Array | float, out: Array) -> None:
-    """Replace by times relative to the middle of their segments, from -2 to 2."""
+def _new_basis(size: int, ntime: int, alpha: float) -> Array:
+    """Memory for the functions at some times, with a row more for the cosines."""
+    basis = np.empty((max(size, 2) + (alpha > 0.0), min(_CHUNK, ntime)))
+    basis[0] = 1.0
+    return basis
+
+
+def _scale(t: Array, start: float, duration: Array | float, alpha: float, out: Array) -> None:
+    """Replace by times relative to the middle of their segments, from -2 to 2, or by a quarter of the angle."""
     if start:
         t = np.subtract(t, start, out)
-    np.subtract(t, 2.0 * quarter, out)
-    np.divide(out, quarter, out)
+    np.subtract(t, 0.5 * duration, out)
+    np.divide(out, 4.0 * duration / alpha if alpha else 0.25 * duration, out)
 
 
-def _fill(functions: Array) -> None:
+def _fill(functions: Array, alpha: float) -> None:
     """Fill the basis (size, ntime) from its first two functions, 1 and the scaled time."""
-    top, size = 1, len(functions)
+    top, size = 1, len(functions) - (alpha > 0.0)
+    if alpha:
+        _change_to_sines(functions[1], functions[size], alpha)
     while 2 * top < size:
         square = functions[2 * top]
         np.multiply(functions[top], functions[top], out=square)
         square -= 2.0
+        if alpha and top == 1:
+            functions[1] *= functions[size]
         more = min(2 * top, size - 2 * top)
         np.multiply(functions[1:more], square, out=functions[2 * top + 1 : 2 * top + more])
         top *= 2
+
+
+def _change_to_sines(angle: Array, cosine: Array, alpha: float) -> None:
+    """Replace a quarter of the angle by the scaled sine of half of it, and set the cosine of that.
+
+    Both follow from the tangent, whose evaluation is faster than that of a sine and as accurate.
+    """
+    np.tan(angle, out=angle)
+    np.multiply(angle, angle, out=cosine)
+    cosine += 1.0
+    np.divide(2.0, cosine, out=cosine)
+    angle *= cosine
+    angle *= 2.0 / math.sin(0.25 * alpha)
+    cosine -= 1.0
 
 
 @lru_cache(maxsize=256)
@@ -373,18 +460,25 @@ def _products_of_chebyshev(size: int) -> Array:
 
 
 def _sample_cells(
-    jet: Callable[[Array, int], Array], duration: float, t: Array, orders: tuple[int, int], out: Array
+    jet: Callable[[Array, int], Array],
+    duration: float,
+    t: Array,
+    orders: tuple[int, int],
+    out: Array,
+    arrangement: Arrangement,
 ) -> bool | None:
     """As `sample`, at sorted times by Taylor series in cells; None if times are not sorted, or series too long."""
+    if arrangement is Arrangement.ANY:
+        return None
     low, high = orders
     size = np.abs(jet(np.linspace(0.0, duration, 9), high + _MAX_TERMS + 2)).max(axis=2)
-    if _is_uniform(t, duration):
+    if arrangement is Arrangement.EVEN:
         step = float(t[-1] - t[0]) / (t.size - 1)
         for cell in (2048, 1024, 512, 256, 128, 64):
             terms = _taylor_terms(size, 0.5 * cell * step, low, high)
             if terms is not None:
                 return _sample_uniform(jet, float(t[0]), step, cell, terms, low, out)
-    elif t[-1] > t[0] and bool(np.all(t[1:] >= t[:-1])):
+    else:
         for cell in (4096, 2048, 1024, 512, 256):
             ncells = -(-t.size // cell)
             terms = _taylor_terms(size, 0.5 * float(t[-1] - t[0]) / ncells, low, high)
@@ -413,10 +507,10 @@ def sample_in_batches(plan: Trajectory, t: Array, low: int, high: int, left: boo
 
 
 def _is_uniform(t: Array, duration: float) -> bool:
-    """Whether the times are evenly spaced up to rounding of times within the segment."""
+    """Whether the times are evenly spaced up to rounding of times within the segment, and increase."""
     step = (t[-1] - t[0]) / (t.size - 1)
     slack = 4.0 * np.finfo(float).eps * duration
-    if not step > 0.0 or abs(t[1] - t[0] - step) > slack:
+    if not step > 2.0 * slack or abs(t[1] - t[0] - step) > slack:
         return False
     ramp = step * np.arange(min(t.size, 2 * _CHUNK))
     beyond = np.empty_like(ramp)
@@ -424,9 +518,20 @@ def _is_uniform(t: Array, duration: float) -> bool:
         part = t[first : first + ramp.size]
         excess = np.subtract(part, ramp[: part.size], out=beyond[: part.size])
         base = t[0] + first * step
-        if excess.max() - base > slack or base - excess.min() > slack:
+        if not (excess.max() - base <= slack and base - excess.min() <= slack):
             return False
     return True
+
+
+def is_increasing(arrangement: Arrangement | None) -> bool:
+    """Whether times are known to be sorted."""
+    return arrangement in (Arrangement.SORTED, Arrangement.EVEN)
+
+
+def _is_sorted(t: Array) -> bool:
+    """Whether no time is below the one before; of times in any order the first ones say so."""
+    first = t[:FEW]
+    return bool((first[1:] >= first[:-1]).all()) and bool((t[1:] >= t[:-1]).all())
 
 
 def _taylor_terms(size: Array, radius: float, low: int, high: int) -> int | None:

@@ -225,6 +225,27 @@ def test_products_are_chebyshev_polynomials(size):
         assert not sampling.Interpolant.of(series[:, None] + 1e308).is_finite
 
 
+@pytest.mark.parametrize("alpha", [1e-9, 0.7, 3.0, 6.2, 2 * np.pi])
+@pytest.mark.parametrize("size", [1, 2, 3, 12, 25])
+def test_products_of_sines_are_all_harmonics(size, alpha):
+    """Cosines and sines of multiples of the angle, in forty digits, from their values at the points alone."""
+    degree, t = size // 2, np.append(np.random.default_rng(size).uniform(0.0, 5.0, 100), [0.0, 2.5, 5.0])
+    with mpmath.workdps(40):
+
+        def harmonics(u):
+            angles = [mpmath.mpf(alpha) * (mpmath.mpf(v) - 0.5) for v in u.tolist()]
+            functions = [(f, k) for f in (mpmath.cos, mpmath.sin) for k in range(f is mpmath.sin, degree + 1)]
+            return np.array([[float(f(k * w)) for w in angles] for f, k in functions])
+
+        points, products = sampling.collocation(alpha, size)
+        given, exact = harmonics(points), harmonics(t / 5.0)
+    assert products.shape == (points.size, 2 * degree + 1)
+    out = np.empty((len(exact), 1, t.size))
+    sampling.evaluate([sampling.Part(given @ products, 0, t.size, 0.0, 5.0)], t, out, alpha)
+    # As for polynomials: rounding of x, multiplied by the derivative of the polynomials.
+    assert (np.abs(out[:, 0] - exact) <= 8 * EPS * (size + 1) ** 2 * np.abs(exact).max(axis=1)[:, None]).all()
+
+
 @pytest.mark.parametrize("alpha", [0.0, 1e-9, 0.7, 3.0, 2 * np.pi])
 def test_functions_between_nodes_in_fifty_digits(alpha):
     """Products of sines and cosines, differentiated by mpmath; near a node as well."""
