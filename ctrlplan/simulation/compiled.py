@@ -22,6 +22,7 @@ from ctrlplan.simulation.one_step import EVALUATIONS, LONGEST, OneStep, has_step
 from ctrlplan.simulation.scales import Scales, Tolerances
 from ctrlplan.simulation.signals import Series, within
 from ctrlplan.symbolic.comparison import Compared
+from ctrlplan.symbolic.many_points import ManyPoints, many_points
 from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
 from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
@@ -38,6 +39,9 @@ state before an interval of less than 1e-9), unless they are equal up to so many
 
 _AT_ONCE = 64
 """Number of times up to which the memory of a function of many times is kept."""
+
+_MANY = 256
+"""Number of times from which on numpy evaluates a function faster, operation by operation."""
 
 _FEW_STEPS = 2_000
 """Maximum number of steps between outputs in the first attempt."""
@@ -144,6 +148,7 @@ class Compiled:
         self._integrators: Lru[tuple[object, ...], Segment] = Lru(_CACHE_SIZE)
         self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
         self._small: Lru[tuple[int, str, int], _AtMany] = Lru(_CACHE_SIZE)
+        self._by_numpy: Lru[str, ManyPoints | None] = Lru(_CACHE_SIZE)
         self._steps: Lru[tuple[int, int, bool, bool], OneStep | None] = Lru(_CACHE_SIZE)
         self._equations: dict[tuple[int, bool, bool], dict[str, ca.SX]] = {}
 
@@ -272,6 +277,10 @@ class Compiled:
         function = self._functions[name]
         if not function.numel_out(0):  # no signals without inputs and outputs
             return np.zeros((0, t.size))
+        if t.size >= _MANY:
+            by_numpy = self._by_numpy.get(name, lambda: many_points(function))
+            if by_numpy is not None:
+                return by_numpy((t[None], x, time_values, p))
 
         def made() -> _AtMany:
             return _AtMany(self._maps.get((name, t.size), lambda: function.map(t.size)), t.size)
