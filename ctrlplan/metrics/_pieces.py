@@ -16,12 +16,12 @@ there, with dynamics that samples as far apart as its time constants do not show
 from the extrapolated curvature alone, is therefore no overshoot of a response.
 """
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +30,17 @@ from ctrlplan._lru import Lru
 from ctrlplan.metrics._records import Array
 
 G = TypeVar("G", bound=np.generic)
+K = TypeVar("K")
+Near = tuple[NDArray[Any], ...]
+Places = tuple[NDArray[np.intp], ...]
 
 _NEIGHBOURS = 4.0  # multiple of a neighbouring third difference above which there is a kink
 _CURVATURES = 0.5  # difference relative to the smaller curvature up to which two curvatures are smooth
 _ASIDE = 0.25  # of the larger curvature: a smaller one of opposite sign is the smooth side of a kink
 _JUMP = 2.0  # multiple of both neighbouring slopes above which there is a jump
 _UNEVEN = 4.0  # ratio of adjacent intervals up to which few digits are lost in products of samples
-_BLOCK = 2**15  # samples
+_ROUNDING = np.finfo(float).eps / 2  # of the terms of a cubic, up to which it is at a level
+_BLOCK = 2**14  # samples
 LONG = 2**9  # samples, from which on one row costs more than the calls for it
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
@@ -44,7 +48,7 @@ _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 NOWHERE = np.empty(0, dtype=np.intp)
 
-_known: ContextVar["dict[Hashable, list[tuple[Array, Array, Pieces]]] | None"] = ContextVar("_known", default=None)
+_known: ContextVar["dict[Hashable, list[tuple[Array, Array, object]]] | None"] = ContextVar("_known", default=None)
 
 
 @dataclass(frozen=True)
@@ -125,7 +129,7 @@ class Pieces:
         """Return the integrals of s times the cubics over s, shape (m,)."""
         return self.a / 2 + self.b / 3 + self.c / 4 + self.d / 5
 
-    @property
+    @cached_property
     def mixed(self) -> NDArray[np.bool_]:
         """Return which intervals have values of both signs; none with a jump."""
         return (self.values.min(axis=0) < 0) & (self.values.max(axis=0) > 0) & ~self.jump
@@ -143,14 +147,16 @@ class Pieces:
         """Return s where p = level, for p monotone from low to high and on either side of the level there."""
         low, high = np.broadcast_arrays(low, high)
         rising = self(high) > self(low)
+        rounding = _ROUNDING * (np.abs(level) + np.abs(self.a) + np.abs(self.b) + np.abs(self.c) + np.abs(self.d))
         s = (low + high) / 2
         found = np.zeros(s.shape, dtype=np.bool_)
         for _ in range(60):  # Newton's method with bisection, which alone would converge in as many
-            above = (self(s) > level) == rising
+            rest = self(s) - level
+            above = (rest > 0) == rising
             low, high = np.where(above, low, s), np.where(above, s, high)
-            newton = s - (self(s) - level) / self.slope(s)
+            newton = s - rest / self.slope(s)
             new = np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
-            found |= np.abs(new - s) <= 1e-15
+            found |= (np.abs(new - s) <= 1e-15) | (np.abs(rest) <= rounding)
             if found.all():
                 break
             s = np.where(found, s, new)  # a root is the same with others in the same call
@@ -194,7 +200,7 @@ def _mean_square(a: Array, end: Array, c: Array, d: Array) -> Array:
 
 @contextmanager
 def shared() -> Iterator[None]:
-    """Compute the cubics of a signal once for all metrics of a block."""
+    """Compute what metrics of a block have in common once for each signal."""
     token = _known.set({})
     try:
         yield
@@ -205,7 +211,7 @@ def shared() -> Iterator[None]:
 def pieces(t: Array, f: Array, chosen: NDArray[np.intp] | None = None, rows: NDArray[np.intp] | None = None) -> Pieces:
     """Return the cubics of a signal (ntime,) on all or some intervals; for several signals, each of its row."""
     if chosen is None:
-        return _once(t, f)
+        return once(_cubics, t, f)
     if rows is None:
         return _cubics(t, f)[chosen]
     # A cubic depends on the samples up to four intervals away: a few windows are faster than whole signals.
@@ -221,48 +227,61 @@ class Bulges:
     def __init__(self, t: Array) -> None:
         step = np.diff(t)
         self._pace, self._width, self._share = 1.0 / step, 1.0 / (t[2:] - t[:-2]), step[1:-1] ** 2 / 4
-        # Of four samples of magnitude 1: both curvatures are at most 2 / (product of the adjacent steps).
-        self._largest = 1.0 + 1e-9 + float((step[1:-1] / (2 * np.minimum(step[:-2], step[2:]))).max(initial=0.0))
 
-    def beyond(self, f: Array, size: Array, level: float, first: int = 0) -> NDArray[np.intp]:
-        """Return the intervals in which the cubic of a signal, or its magnitude, may exceed a level.
+    def beyond(self, f: Array, size: Array, level: Array, first: NDArray[np.intp] | None = None) -> Places:
+        """Return the intervals in which the cubics of signals, or their magnitudes, may exceed a level.
 
         Parameters
         ----------
-        f, size : ndarray, shape (ntime,)
-            The signal, and the signal or its magnitude, which is compared with the level.
-        level : float
-            The level.
-        first : int, default 0
-            First interval. It and the last one, with no bound, are included.
-        """
-        last, inner = f.size - 2, NOWHERE
-        large = ~(np.abs(f[first:]) * self._largest <= level)  # otherwise far below the level, also between samples
-        if large.any():
-            begin = max(first + int(large.argmax()) - 3, first)
-            end = min(f.size - int(large[::-1].argmax()) + 3, f.size)
-            inner = begin + 1 + self._inner(f[begin:end], size[begin:end], level, begin)
-        return np.concatenate([[first], inner, [last][: last - first]]).astype(np.intp)
+        f, size : ndarray, shape (nrows, ntime)
+            The signals, and the signals or their magnitudes, which are compared with the level.
+        level : ndarray, shape (nrows,)
+            The level of each signal; none of its intervals are returned if it is nan.
+        first : ndarray, shape (nrows,), optional
+            First interval of each signal; default: 0. It and the last one, with no bound, are included.
 
-    def _inner(self, f: Array, size: Array, level: float, begin: int) -> NDArray[np.intp]:
-        """Return these intervals of the samples from `begin` on, counted from the second interval."""
-        if f.size < 4:
-            return NOWHERE
-        slope = np.diff(f)
-        slope *= self._pace[begin : begin + slope.size]
-        d = np.diff(slope)
-        d *= self._width[begin : begin + d.size]
+        Returns
+        -------
+        rows, intervals : ndarray
+            In order.
+        """
+        slope = f[:, 1:] - f[:, :-1]
+        slope *= self._pace
+        d = slope[:, 1:] - slope[:, :-1]
+        d *= self._width
         np.abs(d, out=d)
-        reach = np.maximum(d[:-1], d[1:])
-        reach *= self._share[begin : begin + reach.size]
-        reach += np.maximum(size[1:-2], size[2:-1])
-        return np.flatnonzero(~(reach <= level))  # nan is included, as it cannot be excluded
+        reach = np.maximum(d[:, :-1], d[:, 1:])
+        reach *= self._share
+        reach += np.maximum(size[:, 1:-2], size[:, 2:-1])
+        found = np.zeros(slope.shape, dtype=np.bool_)
+        found[:, 1:-1] = ~(reach <= level[:, None])  # nan is included, as it cannot be excluded
+        if first is None:
+            found[:, 0] = True
+        else:
+            found &= np.arange(slope.shape[1]) >= first[:, None]
+            found[np.arange(len(f)), first] = True
+        found[:, -1] = True
+        found[np.isnan(level)] = False
+        return np.nonzero(found)
 
 
 def blocks(f: Array) -> Iterator[slice]:
     """Yield rows (nrows, ntime) in blocks that fit into the cache; long rows one by one, whose cubics may be shared."""
     count = max(1, _BLOCK // f.shape[1]) if f.shape[1] < LONG else 1
     return (slice(begin, begin + count) for begin in range(0, len(f), count))
+
+
+def row_blocks(f: Array) -> Iterator[slice]:
+    """Yield rows (nrows, ntime) in blocks that fit into the cache."""
+    count = max(1, _BLOCK // f.shape[1])
+    return (slice(begin, begin + count) for begin in range(0, len(f), count))
+
+
+def joined(found: list[Places], f: Array) -> Places:
+    """Return rows and intervals of all signals from those of its blocks."""
+    begins = [some.start for some in row_blocks(f)]
+    rows = [NOWHERE, *(rows + begin for (rows, _), begin in zip(found, begins, strict=True))]
+    return np.concatenate(rows), np.concatenate([NOWHERE, *(chosen for _, chosen in found)])
 
 
 def maximum(t: Array, f: Array) -> float:
@@ -282,12 +301,12 @@ def peaks(t: Array, f: Array) -> Array:
 
 def _largest(t: Array, f: Array, size: Callable[[Array], Array], extrapolated: bool) -> Array:
     """Return the maximum of the signals or of their magnitudes."""
-    bulges, top, near = Bulges(t), np.empty(len(f)), []
-    for i, row in enumerate(f):
-        sized = size(row)
-        top[i] = sized.max()
-        near.append(bulges.beyond(row, sized, float(top[i])) if np.isfinite(top[i]) else NOWHERE)
-    chosen, rows = gathered(near)
+    bulges, top, near = Bulges(t), np.empty(len(f)), list[Places]()
+    for some in row_blocks(f):
+        sized = size(f[some])
+        top[some] = largest = sized.max(axis=1)
+        near.append(bulges.beyond(f[some], sized, np.where(np.isfinite(largest), largest, np.nan)))
+    rows, chosen = joined(near, f)
     p = pieces(t, f, chosen, rows)
     inner = np.fmax.reduce(size(p(p.cuts)), axis=0)
     np.fmax.at(top, rows, inner if extrapolated else np.where(p.begins, -np.inf, inner))
@@ -314,39 +333,51 @@ class Smooth:
     """Cubics of signals on inner intervals with smooth curvature, where they are linear in four samples."""
 
     def __init__(self, t: Array) -> None:
-        self.step, self.width, self.span = np.diff(t), t[2:] - t[:-2], t[3:] - t[:-3]
+        self.times, self.step, self.width, self.span = t, np.diff(t), t[2:] - t[:-2], t[3:] - t[:-3]
+        self._quarter = self.step[1:-1] ** 2 / 4
 
     def differences(self, f: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """Return slopes, curvatures and third differences, and which of these are smooth.
+        """Return slopes, curvatures and third differences of signals (nrows, ntime), and which of these are smooth.
 
-        Shapes (ntime - 1,), (ntime - 2,) and twice (ntime - 3,).
+        Shapes (nrows, ntime - 1), (nrows, ntime - 2) and twice (nrows, ntime - 3).
         """
-        slope = np.diff(f)
+        slope = f[:, 1:] - f[:, :-1]
         slope /= self.step
-        d = np.diff(slope)
+        d = slope[:, 1:] - slope[:, :-1]
         d /= self.width
-        third, size = np.diff(d), np.abs(d)
-        smooth = np.abs(third) <= _CURVATURES * np.minimum(size[:-1], size[1:])
+        third, size = d[:, 1:] - d[:, :-1], np.abs(d)
+        smooth = np.abs(third) <= _CURVATURES * np.minimum(size[:, :-1], size[:, 1:])
         third /= self.span
         return slope, d, third, smooth
 
-    def areas(self, f: Array, begin: Array | None) -> tuple[Array, NDArray[np.bool_]]:
-        """Return integrals over inner intervals of known sign, and which these are, shapes (ntime - 3,).
+    def keeps_sign(self, f: Array, d: Array) -> NDArray[np.bool_]:
+        """Return on which inner intervals signals with curvatures d are known to be of one sign, if they are smooth."""
+        size, bend = np.abs(f), np.abs(d)
+        bulge = np.maximum(bend[:, :-1], bend[:, 1:])
+        bulge *= self._quarter
+        return np.asarray((f[:, 1:-2] * f[:, 2:-1] >= 0) & (bulge <= np.minimum(size[:, 1:-2], size[:, 2:-1])))
 
-        With `begin`, the starts of all intervals relative to a time, the signal is weighted by the time after it.
+    def near(self, f: Array, found: tuple[Array, Array, Array, NDArray[np.bool_]], at: Places, begin: int) -> Near:
+        """Return what determines the cubics of signals at some inner intervals, with the `differences` of the signals.
+
+        The first row has the index `begin` among all signals.
         """
-        _, d, third, smooth = self.differences(f)
-        size, step, a, end = np.abs(f), self.step[1:-1], f[1:-2], f[2:-1]
+        slope, d, third, smooth = found
+        rows, k = at
+        steep = np.abs(slope[rows, k + 1]) > _JUMP * np.maximum(np.abs(slope[rows, k]), np.abs(slope[rows, k + 2]))
+        samples = f[rows, k + 1], f[rows, k + 2], f[rows, k + 3]
+        return begin + rows, k, smooth[at], third[at], *_neighbours(third, at), d[at], d[rows, k + 1], *samples, steep
+
+    def pieces(self, near: Near) -> Pieces:
+        """Return the cubics of signals on their inner intervals."""
+        _, k, smooth, c, before, after, one, other, a, end, later, steep = near
+        base, twist, broken, begins = _sided(c, before, after, one, other, self.span[k])
+        base, twist = np.where(smooth, one, base), np.where(smooth, c, twist)
+        step, rise = self.step[k + 1], end - a
         square = step * step
-        bulge = np.maximum(np.abs(d[:-1]), np.abs(d[1:])) * square
-        known = smooth & (a * end >= 0) & (bulge <= 4 * np.minimum(size[1:-2], size[2:-1]))
-        bow, twist = _bent(d[:-1], third, self.step[:-2], step)
-        bow += twist
-        mean = (a + end) / 2 - bow / 6 - twist / 12
-        if begin is not None:
-            known &= begin[1:-1] >= 0
-            mean = begin[1:-1] * mean + step * (a / 6 + end / 3 - bow / 12 - twist / 20)
-        return step * mean, known
+        bow, twist = (base + self.step[k] * twist) * square, twist * (square * step)
+        jump, begins = broken & steep & ~smooth, begins & ~smooth & (rise * (later - end) > 0)
+        return Pieces(self.times[k + 1], step, a, rise - bow, bow - twist, twist, end, jump, begins)
 
 
 class _SquareForm(Smooth):
@@ -357,7 +388,6 @@ class _SquareForm(Smooth):
 
     def __init__(self, t: Array) -> None:
         super().__init__(t)
-        self._t = t
         early, step, late = self.step[:-2], self.step[1:-1], self.step[2:]
         none, one = np.zeros_like(step), np.ones_like(step)
         # Factors of the samples k - 1 to k + 2, shape (4, m), for the interval from k to k + 1.
@@ -374,38 +404,23 @@ class _SquareForm(Smooth):
 
     def __call__(self, f: Array) -> Array:
         """Return the integrals of signals (nrows, ntime), shape (nrows,)."""
-        found, rough, near = np.empty(len(f)), list[NDArray[np.intp]](), list[tuple[NDArray[np.generic], ...]]()
-        for i, row in enumerate(f):
+        found, near = np.empty(len(f)), list[Near]()
+        for some in row_blocks(f):
+            differences = self.differences(f[some])
+            near.append(self.near(f[some], differences, np.nonzero(~differences[3]), some.start))
+        for i, row in enumerate(f):  # a row has the same sum with others in the same call
             found[i] = sum(band @ (row[: band.size] * row[row.size - band.size :]) for band in self._bands)
-            slope, d, third, smooth = self.differences(row)
-            k = np.flatnonzero(~smooth)
-            steep = np.abs(slope[k + 1]) > _JUMP * np.maximum(np.abs(slope[k]), np.abs(slope[k + 2]))
-            near.append((third[k], *_neighbours(third, (k,)), d[k], d[k + 1], row[k + 1], row[k + 2], steep))
-            rough.append(k)
-        every, rows = gathered(rough)
-        np.add.at(found, rows, self._corrections(every, *map(np.concatenate, zip(*near, strict=True))))
+        columns = together(near)
+        np.add.at(found, columns[0], self._corrections(columns))
+        rows = np.arange(len(f)).repeat(2)
         ends = np.tile([0, f.shape[1] - 2], len(f))
-        np.add.at(found, np.repeat(np.arange(len(f)), 2), pieces(self._t, f, ends, np.arange(len(f)).repeat(2)).squares)
+        np.add.at(found, rows, pieces(self.times, f, ends, rows).squares)
         return found
 
-    def _corrections(
-        self,
-        k: NDArray[np.intp],
-        c: Array,
-        before: Array,
-        after: Array,
-        one: Array,
-        other: Array,
-        a: Array,
-        end: Array,
-        steep: Array,
-    ) -> Array:
-        """Return what the cubics of inner intervals k + 1 without smooth curvature add to the form."""
-        base, cut, broken, _ = _sided(c, before, after, one, other, self.span[k])
-        early, step = self.step[k], self.step[k + 1]
-        squares = _mean_square(a, end, *_bent(base, cut, early, step))
-        squares = np.where(broken & (steep > 0), (a**2 + end**2) / 2, squares)
-        return step * (squares - _mean_square(a, end, *_bent(one, c, early, step)))
+    def _corrections(self, near: Near) -> Array:
+        """Return what the cubics of inner intervals without smooth curvature add to the form."""
+        p, k, c, one = self.pieces(near), near[1], near[3], near[6]
+        return p.squares - p.step * _mean_square(p.a, p.end, *_bent(one, c, self.step[k], p.step))
 
 
 _FORMS: Lru[bytes, _SquareForm] = Lru(4)
@@ -418,24 +433,30 @@ def _bent(base: Array, third: Array, early: Array, step: Array) -> tuple[Array, 
     return (base + early * third) * square - d, d
 
 
+def together(near: Sequence[Near]) -> Near:
+    """Return the columns of all blocks of signals."""
+    return tuple(np.concatenate(column) for column in zip(*near, strict=True))
+
+
 def gathered(chosen: list[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the chosen intervals of all rows in one array, and their rows."""
     return np.concatenate([NOWHERE, *chosen]), np.repeat(np.arange(len(chosen)), [k.size for k in chosen])
 
 
-def _once(t: Array, f: Array) -> Pieces:
-    """Return the cubics of a signal, those known if they are shared."""
+def once(make: Callable[[Array, Array], K], t: Array, f: Array) -> K:
+    """Return what is computed of a signal, or of several; that known if it is shared."""
     known = _known.get()
     if known is None:
-        return _cubics(t, f)
+        return make(t, f)
     # Signals are known by their values, as a measure may use an array for one signal after the other.
-    same = known.setdefault((f.shape, *f.flat[[0, f.size // 2, -1]].tolist()), [])
+    same = known.setdefault((make, f.shape, *f.flat[[0, f.size // 2, -1]].tolist()), [])
     for times, signal, found in same:
         if np.array_equal(signal, f) and np.array_equal(times, t):
-            return found
+            return cast(K, found)
     times, signal = t.copy(), f.copy()
-    same.append((times, signal, _cubics(times, signal)))
-    return same[-1][2]
+    made = make(times, signal)
+    same.append((times, signal, made))
+    return made
 
 
 def _cubics(t: Array, f: Array) -> Pieces:

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from enum import Enum
+from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
 import casadi as ca
@@ -22,6 +23,7 @@ from ctrlplan.simulation.one_step import EVALUATIONS, LONGEST, OneStep, has_step
 from ctrlplan.simulation.scales import Scales, Tolerances
 from ctrlplan.simulation.signals import Series, within
 from ctrlplan.symbolic.comparison import Compared
+from ctrlplan.symbolic.many_points import ManyPoints, many_points
 from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
 from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
@@ -38,6 +40,9 @@ state before an interval of less than 1e-9), unless they are equal up to so many
 
 _AT_ONCE = 64
 """Number of times up to which the memory of a function of many times is kept."""
+
+_MANY = 256
+"""Number of times from which on numpy evaluates a function faster, operation by operation."""
 
 _FEW_STEPS = 2_000
 """Maximum number of steps between outputs in the first attempt."""
@@ -78,17 +83,29 @@ class Kind(Enum):
     FIXED_POINT = "adams", "functional"
 
 
-class Motion(NamedTuple):
-    """Norm of a Jacobian [1/s] and its fastest decay rate [1/s]; infinite where it is not finite."""
+class Motion:
+    """Rates of motion of linearised equations.
 
-    norm: float
-    decay: float
+    Attributes
+    ----------
+    norm : float
+        Norm of the Jacobian [1/s]; infinite if that is not finite.
+    """
+
+    def __init__(self, jacobian: Array) -> None:
+        self._jacobian = jacobian
+        self.norm = float(np.linalg.norm(jacobian)) if np.isfinite(jacobian).all() else np.inf
+
+    @cached_property
+    def decay(self) -> float:
+        """Fastest decay rate [1/s], at most the norm."""
+        return -float(np.linalg.eigvals(self._jacobian).real.min()) if self.norm < np.inf else np.inf
 
     def kind(self, length: float) -> Kind:
         """Kind of integration for a segment of given length [s]."""
         if self.norm * length < _SHORT:
             return Kind.FIXED_POINT
-        return Kind.BDF if self.decay * length > _STIFF else Kind.ADAMS
+        return Kind.BDF if self.norm * length > _STIFF and self.decay * length > _STIFF else Kind.ADAMS
 
 
 class Compiled:
@@ -144,6 +161,8 @@ class Compiled:
         self._integrators: Lru[tuple[object, ...], Segment] = Lru(_CACHE_SIZE)
         self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
         self._small: Lru[tuple[int, str, int], _AtMany] = Lru(_CACHE_SIZE)
+        self._by_numpy: Lru[str, ManyPoints | None] = Lru(_CACHE_SIZE)
+        self._patterns: Lru[tuple[float, ...], tuple[Array, Pattern]] = Lru(_CACHE_SIZE)
         self._steps: Lru[tuple[int, int, bool, bool], OneStep | None] = Lru(_CACHE_SIZE)
         self._equations: dict[tuple[int, bool, bool], dict[str, ca.SX]] = {}
 
@@ -228,10 +247,7 @@ class Compiled:
     def motion(self, t: float, x: Array, time_values: Array, p: Array) -> Motion:
         """Rates of motion by the equations linearised at a state."""
         n = self.moving.size
-        jacobian = self.slopes(np.array([t]), x[:, None], time_values[:, None], p).reshape(n, n, order="F")
-        if not np.isfinite(jacobian).all():
-            return Motion(np.inf, np.inf)
-        return Motion(float(np.linalg.norm(jacobian)), -float(np.linalg.eigvals(jacobian).real.min()))
+        return Motion(self.slopes(np.array([t]), x[:, None], time_values[:, None], p).reshape(n, n, order="F"))
 
     def integrator(self, settings: Settings) -> Segment:
         """CVODES over a segment scaled to length 1, with outputs at given times."""
@@ -245,6 +261,16 @@ class Compiled:
         key = threading.get_ident(), settings.width, settings.harmonic, settings.scaled
         found = self._steps.get(key, lambda: OneStep(equations) if has_step(equations) else None)
         return OneStep(equations) if found is not None and found.is_running else found
+
+    def pattern(self, left: float, grid: Array) -> Pattern:
+        """Output times of a segment from `left` in units of it, found once for many of them."""
+        if grid.size == 1:
+            return _END
+        if grid.size <= _AT_ONCE:
+            return Pattern.of(left, grid)
+        key = left, grid.size, *grid[[0, grid.size // 2, -1]].tolist()
+        times, found = self._patterns.get(key, lambda: (grid.copy(), Pattern.of(left, grid)))
+        return found if np.array_equal(times, grid) else Pattern.of(left, grid)
 
     def has_integrator(self, settings: Settings) -> bool:
         """Whether an integrator has been built."""
@@ -272,6 +298,10 @@ class Compiled:
         function = self._functions[name]
         if not function.numel_out(0):  # no signals without inputs and outputs
             return np.zeros((0, t.size))
+        if t.size >= _MANY:
+            by_numpy = self._by_numpy.get(name, lambda: many_points(function))
+            if by_numpy is not None:
+                return by_numpy((t[None], x, time_values, p))
 
         def made() -> _AtMany:
             return _AtMany(self._maps.get((name, t.size), lambda: function.map(t.size)), t.size)
@@ -319,6 +349,34 @@ class Compiled:
         return [
             ca.vertcat(*[p[k] for k, (j, _) in enumerate(self._places) if j == i]) for i in range(len(self._traces))
         ]
+
+
+class Pattern(NamedTuple):
+    """Output times of a segment.
+
+    Attributes
+    ----------
+    resolved : int
+        Number of times that CVODES distinguishes, from the first one.
+    relative : ndarray, shape (ntime,)
+        Times in units of the segment, rounded.
+    grid : bytes
+        The same.
+    longest : float
+        Longest interval between them.
+    """
+
+    resolved: int
+    relative: Array
+    grid: bytes
+    longest: float
+
+    @classmethod
+    def of(cls, left: float, grid: Array) -> Pattern:
+        """Pattern of times of a segment, the last its end."""
+        relative = _rounded((grid - left) / (grid[-1] - left))
+        longest = round(float(np.diff(relative, prepend=0.0).max()), 6)
+        return cls(_resolved(left, grid), relative, relative.tobytes(), longest)
 
 
 class Settings(NamedTuple):
@@ -406,7 +464,7 @@ class CompiledSolver:
         self._scaled = bool(np.any(self._shift != 0.0) or np.any(self._scale != 1.0))
         self._tolerances = float(tolerances.rtol.min(initial=1.0)), tolerances.atol
         self._longest, self._kind, self._segments, self._patterns = 0.0, Kind.ADAMS, 0, 0
-        self._motion, self._short = Motion(0.0, 0.0), 0
+        self._motion, self._short = Motion(np.zeros((0, 0))), 0
         self._counts = equations.compared.is_expected
         self._series: Series | None = None
         self._known = np.empty(0)
@@ -448,7 +506,8 @@ class CompiledSolver:
         rtol, atol = self._tolerances
         reach = (rtol * np.abs(states) + (atol * self._scales.scale)[:, None]) * _EDGE
         near = np.concatenate([states - reach, states, states + reach], axis=1)
-        return not np.isfinite(self.form.rates(np.tile(times, 3), near, np.tile(time_values, 3), self._p)).all()
+        places = np.concatenate([times] * 3), near, np.concatenate([time_values] * 3, axis=1)
+        return not np.isfinite(self.form.rates(*places, self._p)).all()
 
     def instants(self, first: float, last: float, time_values: Callable[[Array], Array]) -> list[float]:
         """Times of a run at which the equations switch depending on functions of time only."""
@@ -456,17 +515,17 @@ class CompiledSolver:
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment; the last is its end."""
-        count = _resolved(left, grid)
-        if count == grid.size:
-            return self._advanced(series, left, grid, state)
+        pattern = self.form.pattern(left, grid)
+        if pattern.resolved == grid.size:
+            return self._advanced(series, left, grid, state, pattern)
         parts = list[Array]()
         while grid.size:
-            parts.append(self._advanced(series, left, grid[:count], state))
-            left, state, grid = float(grid[count - 1]), parts[-1][:, -1], grid[count:]
-            count = _resolved(left, grid)
+            some = grid[: self.form.pattern(left, grid).resolved]
+            parts.append(self._advanced(series, left, some, state, self.form.pattern(left, some)))
+            left, state, grid = float(some[-1]), parts[-1][:, -1], grid[some.size :]
         return np.concatenate(parts, axis=1)
 
-    def _advanced(self, series: Series, left: float, grid: Array, state: Array) -> Array:
+    def _advanced(self, series: Series, left: float, grid: Array, state: Array, pattern: Pattern) -> Array:
         """The same for times that are not too close together."""
         moving = self.form.moving
         if not moving.size:
@@ -478,10 +537,9 @@ class CompiledSolver:
             self._longest = max(self._longest, right - left)
             self._kind = self._motion.kind(self._longest)
         self._segments += 1
-        relative = _ONLY_END if grid.size == 1 else _pattern((grid - left) / (right - left))
-        settings = self._settings(series, relative)
+        settings = self._settings(series, pattern)
         if self._is_rare(settings, grid.size):
-            each = [self._advanced(series, left, grid[k : k + 1], state) for k in range(grid.size)]
+            each = [self._advanced(series, left, grid[k : k + 1], state, _END) for k in range(grid.size)]
             return np.concatenate(each, axis=1)
         if series is not self._series:
             undefined = np.where(np.isfinite(_terms(series)).all(axis=1), 0.0, np.nan)
@@ -492,7 +550,7 @@ class CompiledSolver:
         span = (left, right - left, series.left, last, *within(left, right, self.switches))
         start = (state[moving] - self._shift) / self._scale
         try:
-            found = self._solved(settings, (start, self._known, span, state), relative)
+            found = self._solved(settings, (start, self._known, span, state), pattern.relative)
         except _SegmentError as error:
             why = f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {error}"
             raise SolverError(why) from None
@@ -510,13 +568,13 @@ class CompiledSolver:
         """Start counting evaluations."""
         self._counts = True
 
-    def _settings(self, series: Series, relative: Array) -> Settings:
+    def _settings(self, series: Series, pattern: Pattern) -> Settings:
         # Equations that depend on time are evaluated at least once per sample, so that no pulse is skipped.
-        longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self.form.depends_on_time else 0.0
+        longest = pattern.longest if self.form.depends_on_time else 0.0
         allowed = min(_FEW_STEPS, self._max_steps)
         width = _terms(series).shape[1]
         what = width, series.harmonics is not None, self._scaled
-        return Settings(*what, relative.tobytes(), self._kind, *self._tolerances, allowed, longest)
+        return Settings(*what, pattern.grid, self._kind, *self._tolerances, allowed, longest)
 
     def _is_rare(self, settings: Settings, count: int) -> bool:
         """Whether a pattern of some output times is integrated to each of them, without an integrator of its own."""
@@ -569,15 +627,16 @@ class CompiledSolver:
         return found
 
 
+_END = Pattern(1, np.ones(1), np.ones(1).tobytes(), 1.0)
+"""Pattern of the end of a segment only."""
+
+
 class _SegmentError(Exception):
     """CVODES failed over a segment."""
 
     def __init__(self, flag: str) -> None:
         super().__init__(_FAILURES.get(flag, "the equations could not be evaluated"))
         self.too_long = flag == "CV_TOO_MUCH_WORK"
-
-
-_ONLY_END = np.ones(1)
 
 
 class _AtMany:
@@ -607,7 +666,7 @@ class _AtMany:
             self.is_running = False
 
 
-def _pattern(relative: Array) -> Array:
+def _rounded(relative: Array) -> Array:
     """Relative output times of a segment; rounded, as rounding errors of time must not require a new integrator."""
     rounded = np.round(relative, _DIGITS)
     gaps = np.diff(rounded)

@@ -10,7 +10,6 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import trapezoid
 
 from ctrlplan._types import Array
 from ctrlplan.simulation.budget import TimeLimitError
@@ -330,7 +329,7 @@ class Attempt(Generic[S]):
         rates = self._growth_rates[: t.size]
         if t.size < 2 or not self._slopes.size or not np.isfinite(rates).all():
             return False
-        return float(trapezoid(rates, t)) > math.log(_GROWTH)
+        return float(0.5 * (t[1:] - t[:-1]) @ (rates[1:] + rates[:-1])) > math.log(_GROWTH)
 
     @property
     def tolerances(self) -> Tolerances:
@@ -358,7 +357,7 @@ class Attempt(Generic[S]):
     @cached_property
     def visited(self) -> tuple[Array, Array, Array]:
         """Some times and states of the run, and the values of the functions of time."""
-        some = np.unique(np.linspace(0, self.run.times.size - 1, VISITED).astype(int))
+        some = _evenly(self.run.times.size)
         t = self.run.times[some]
         return t, self.run.states[:, some], self.time_signals.at(t)
 
@@ -397,6 +396,14 @@ class Attempt(Generic[S]):
         with np.errstate(all="ignore"):
             places = t, self.job.state[:, None], self.time_signals.at(t)
             return np.asarray(on_trial(self.solver, self.solver.slopes, *places, (-1, n, n))[0])
+
+
+@lru_cache(maxsize=32)
+def _evenly(count: int) -> NDArray[np.intp]:
+    """Indices of the visited states among those at so many times."""
+    found = np.unique(np.linspace(0, count - 1, VISITED).astype(np.intp))
+    found.flags.writeable = False
+    return found
 
 
 @lru_cache(maxsize=32)

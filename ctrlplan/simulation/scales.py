@@ -133,7 +133,9 @@ class Scales:
         moved = np.abs(states - states[:, :1]).max(axis=1, initial=0.0)
         size = np.abs(states).max(axis=1, initial=0.0)
         unresolved = moved < self.atol * self.scale
-        real = (moved > 0.0) & ~(unresolved & self.unresolved) & np.isin(np.arange(len(states)), moving)
+        moves = np.zeros(len(states), dtype=bool)
+        moves[moving] = True
+        real = (moved > 0.0) & ~(unresolved & self.unresolved) & moves
         small = real & (moved < _SMALL * self.scale)
         about = real & (moved < _OFFSET * size) & (self.shift == 0.0)
         if not (small | about).any():
@@ -271,9 +273,7 @@ def effects(slopes: Array, duration: float, growth: Array | None = None) -> Arra
     growth = growth_rates(slopes) if growth is None else growth
     finite = np.isfinite(growth)
     matrices = (1.0 + duration * growth[finite])[:, None, None] * np.eye(n) - duration * slopes[finite]
-    found: Array = np.abs(np.linalg.solve(matrices, np.broadcast_to(np.eye(n), matrices.shape))).max(
-        axis=0, initial=0.0
-    )
+    found: Array = np.abs(np.linalg.inv(matrices)).max(axis=0, initial=0.0)
     np.fill_diagonal(found, 0.0)
     return found
 

@@ -275,8 +275,8 @@ class _Recorded:
     def run(self, end: float, state: Array) -> NetworkRun:
         """The run until an end in the last segment, with the state there."""
         if self._segments:
-            before = self._times[-1] < end
-            self._times[-1], self._states[-1] = self._times[-1][before], self._states[-1][:, before]
+            count = int(self._times[-1].searchsorted(end))
+            self._times[-1], self._states[-1] = self._times[-1][:count], self._states[-1][:, :count]
         t = np.concatenate([*self._times, np.array([end])])
         x = np.concatenate([*self._states, state[:, None]], axis=1)
         return NetworkRun(t, x, self._segments)

@@ -114,7 +114,7 @@ def test_absolute_integrals_of_several_signals_together():
     def area(s):
         return s**3 / 3 - (a + b) * s**2 / 2 + a * b * s
 
-    def moment(s):
+    def moment(s, since=since):
         return s**4 / 4 - (a + b + since) * s**3 / 3 + (a * b + since * (a + b)) * s**2 / 2 - since * a * b * s
 
     whole = 2 * (area(a) - area(b)) + area(4)
@@ -123,3 +123,7 @@ def test_absolute_integrals_of_several_signals_together():
     below = moment(since) + moment(4) - 2 * moment(b)
     above = (16 - since**2) / 2 - since * (4 - since) + (4**5 - since**5) / 5 - since * (4**4 - since**4) / 4
     np.testing.assert_allclose(found, [below, above], rtol=1e-13)
+    early = -0.75
+    found = metrics.itae(t, np.array([-parabola, positive]), start=early)
+    whole = 2 * moment(a, early) - 2 * moment(b, early) + moment(4, early)
+    np.testing.assert_allclose(found, [whole, 8 + 4**5 / 5 - early * 68], rtol=1e-13)

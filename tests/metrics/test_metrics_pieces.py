@@ -1,5 +1,7 @@
 """What metrics take a signal for between its samples: exact where it can be, sane where it cannot."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
 from ctrlplan import metrics
-from ctrlplan.metrics._pieces import pieces, shared
+from ctrlplan.metrics._pieces import Smooth, pieces, shared
 
 UNEVEN = np.array([-1.0, -0.7, 0.1, 0.3, 0.9, 1.0, 1.8, 2.5])
 
@@ -196,6 +198,21 @@ def test_integrals_and_peaks_of_long_signals_are_those_of_every_cubic(kind, spre
     between = np.abs(cubics(fine[:, None])).max()
     bend = np.abs(cubics.c).max() + 3 * np.abs(cubics.d).max()
     assert between - 1e-14 * np.abs(f).max() <= metrics.peak(t, f) <= between + 0.5 * (0.5 / 200) ** 2 * 2 * bend
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.4, 1.0])
+def test_cubics_of_inner_intervals_are_those_of_whole_signals(spread):
+    """From the differences of several signals at all inner intervals, to the bit."""
+    t = np.linspace(0.0, 3.0, 800)
+    t[1:-1] += spread * t[1] * np.random.default_rng(1).uniform(-0.5, 0.5, 798)
+    f = np.array([of(t) for of in SIGNALS.values()])
+    smooth, every = Smooth(t), np.nonzero(np.ones((len(f), t.size - 3), dtype=bool))
+    near = smooth.near(f, smooth.differences(f), every, 5)
+    np.testing.assert_array_equal(near[0], 5 + every[0])
+    found, whole = smooth.pieces(near), [pieces(t, row) for row in f]
+    for field in fields(found):
+        expected = np.concatenate([getattr(p, field.name)[1:-1] for p in whole])
+        np.testing.assert_array_equal(getattr(found, field.name), expected, field.name)
 
 
 @pytest.mark.parametrize("metric", [metrics.iae, metrics.itae, metrics.peak])
