@@ -26,8 +26,8 @@ from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
 from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
 _CACHE_SIZE, _INTEGRATORS = 64, 256
-"""Number of cached functions of many times, and of cached integrators, one for each pattern of output times. Plans whose
-segments end between samples have tens of patterns each; an integrator has 0.1 MB and is built in 2 ms.
+"""Number of cached functions of many times, and of cached integrators (0.1 MB), one for each pattern of output times:
+a plan whose segments end between samples has tens of patterns.
 """
 
 _DIGITS, _NEAR, _EVEN = 12, 1e-9, 1e-4
