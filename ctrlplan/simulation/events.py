@@ -14,9 +14,12 @@ from scipy.optimize import brentq
 
 from ctrlplan._types import Array, EventName
 
-_BEFORE, _NEWTON, _STEPS = 5, 6, 5
+_BEFORE, _NEWTON, _STEPS = 5, 6, 12
 """Number of samples before a crossing by which it is extrapolated, steps to the root of their polynomial, and maximum
-number of values near it before the interval of the samples is searched."""
+number of values by secants before the interval of the samples is searched."""
+
+_APART = 1e3
+"""Distance of two times, in tolerances of a root, above which the slope between them is used."""
 
 Signal = Callable[[Array, Array, Array, Array], Array]
 """(t, x, u, y) at many times, time last -> values (ntime,)."""
@@ -287,32 +290,55 @@ def _root(
         return found
 
     size = max(abs(left), abs(right), right - left)
-    near = _near(value, left, right, at_right, *expected, 1e-12 * (right - left) + 1e-14 * size)
-    if near is not None:
-        return near
-    brentq(value, left, right, xtol=1e-15 * size, rtol=1e-14)
+    tolerance = 1e-12 * (right - left) + 1e-14 * size
+    found, low, high = _near(value, (left, right), (at_left, at_right), *expected, tolerance)
+    if found is not None:
+        return found
+    brentq(value, low, high, xtol=tolerance, rtol=1e-14)
     return min(crossed)
 
 
 def _near(
     value: Callable[[float], float],
-    left: float,
-    right: float,
-    at_right: float,
+    ends: tuple[float, float],
+    at_ends: tuple[float, float],
     t: float,
     slope: float,
     tolerance: float,
-) -> float | None:
-    """Root near t within a tolerance, on the side of `right`; None if it is not found in a few steps."""
+) -> tuple[float | None, float, float]:
+    """Root by secants within a tolerance, on the side of the right end, and the ends of the interval that is left.
+
+    The root is None if it is not found in a few steps. The first time and slope are expected ones. A step that leaves
+    the interval is replaced by one to its chord, the second of two in succession by one to the right end, where the
+    signal may jump.
+    """
+    (low, high), (at_low, at_high) = ends, at_ends
+    side, before, at_before, is_chord = at_high, math.nan, math.nan, False
     for _ in range(_STEPS):
-        if not left < t < right or not slope * at_right > 0.0:
-            return None
+        if low < t < high and slope * side > 0.0:
+            is_chord = False
+        else:
+            slope = (at_high - at_low) / (high - low)
+            t = high - tolerance if is_chord else low - at_low / slope
+            is_chord = not is_chord
+            if not low < t < high:
+                break
         found = value(t)
-        change = found / slope
+        if abs(t - before) > _APART * tolerance:
+            slope = (found - at_before) / (t - before)
+        before, at_before = t, found
+        crossed = found * side >= 0.0
+        if crossed:
+            high, at_high = t, found
+        else:
+            low, at_low = t, found
+            if high - low <= 1.5 * tolerance:
+                return high, low, high
+        change = found / slope if slope * side > 0.0 else math.inf
         if abs(change) > tolerance:
-            t += 0.5 * tolerance - change  # probably on the side of `right`
-        elif found * at_right >= 0.0:
-            return t
+            t += 0.5 * tolerance - change  # probably on the side of the right end
+        elif crossed:
+            return t, low, high
         else:
             t += 2.0 * abs(change) + float(np.spacing(t))
-    return None
+    return None, low, high

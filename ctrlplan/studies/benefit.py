@@ -249,14 +249,14 @@ def benefit_of(
     reference = PolySpline(points, warn=False)
     held: dict[str, object] = dict(peak_limits(reference) if choices.limits is None else choices.limits)
     limited = Limited(reference, held, choices.quantities)
-    setting = _Setting(experiment, loop, choices, held, _shaper(loop, choices.mode), reference)
     planned = TrigSpline(points, alpha=choices.alpha)
+    setting = _Setting(experiment, loop, choices, held, _shaper(loop, choices.mode), reference, planned.alpha)
     plans: dict[str, Trajectory] = {PLANNED: planned} | setting.baselines(points)
     own, ran = setting.run(points, plans, experiment.measures)
     found = comparison_of(own, ran, units, title=title)
     roles = {name: Role.BASELINE if role is Role.PLANNED else role for name, role in found.roles.items()}
     found = replace(found, roles=roles | {PLANNED: Role.PLANNED})
-    grids = _grids(setting, found, _decisive(choices.decisive, found))
+    grids = _grids(setting, found, _decisive(choices.decisive, found), ran)
     note = choices.note if choices.limits is not None else " ".join(filter(None, (choices.note, OWN_LIMITS)))
     return Benefit(found, held, _required_durations(setting, plans, planned, limited), grids, planned.alpha, note)
 
@@ -275,6 +275,8 @@ class _Setting:
         Input shaper for step and S-curve.
     reference : PolySpline
         The polynomial through the waypoints.
+    alpha : float
+        Shape parameter of the planned reference [rad].
     """
 
     experiment: Experiment
@@ -283,6 +285,7 @@ class _Setting:
     limits: Mapping[str, object]
     shaper: Shaper | None
     reference: PolySpline
+    alpha: float
 
     def baselines(self, points: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
         """Baselines of the planned reference."""
@@ -305,26 +308,54 @@ class _Setting:
         )
         return experiment, experiment.run(loop)
 
-    def rows(self, factor: float, decisive: Sequence[str]) -> tuple[dict[str, dict[str, float]], list[str]]:
+    def rows(
+        self, factor: float, decisive: Sequence[str], own: Measured
+    ) -> tuple[dict[str, dict[str, float]], list[str]]:
         """Metrics of trigonometric plans, by alpha, and of baselines at another duration; names of the latter.
 
         A plan whose loop cannot be built, or whose run is ended by an event,
-        is ranked last; a baseline in this case has no value.
+        is ranked last; a baseline in this case has no value. `own` are the runs
+        at the duration of the waypoints.
         """
         scaled = _scaled(self.experiment.waypoints, factor)
         shapes: dict[str, Trajectory] = {f"{a:g}": TrigSpline(scaled, alpha=a, warn=False) for a in self.choices.alphas}
         baselines = self.baselines(scaled)
-        _, ran = self.run(scaled, shapes | baselines, _only(self.experiment.measures, decisive))
+        same = {f"{a:g}": PLANNED for a in self.choices.alphas if a == self.alpha} | {name: name for name in baselines}
+        known = {name: run for name, run in same.items() if factor == 1.0 and run in own.runs}
+        ran = self._completed(scaled, shapes | baselines, decisive, known, own)
         worst, none = dict.fromkeys(decisive, np.inf), dict.fromkeys(decisive, np.nan)
         rows = {name: worst | ran.metrics.get(name, {}) for name in (*shapes, *baselines)}
         stopped = [name for name, run in ran.runs.items() if run.stop is not None]
         return rows | {name: worst if name in shapes else none for name in stopped}, list(baselines)
 
+    def _completed(
+        self,
+        points: tuple[Waypoint, ...],
+        plans: dict[str, Trajectory],
+        decisive: Sequence[str],
+        known: Mapping[str, str],
+        own: Measured,
+    ) -> Measured:
+        """Runs of plans; those known have other names in `own`."""
+        measures, others = _only(self.experiment.measures, decisive), {**plans}
+        for name in known:
+            del others[name]
+        try:
+            ran = self.run(points, others, measures)[1] if others else Measured({})
+        except Exception:  # each of these plans fails: they are run with those that do not
+            if not known:
+                raise
+            return self.run(points, plans, measures)[1]
+        return Measured(
+            {name: own.metrics[run] for name, run in known.items()} | ran.metrics,
+            {name: own.runs[run] for name, run in known.items()} | ran.runs,
+        )
 
-def _grids(setting: _Setting, found: Comparison, decisive: Sequence[str]) -> tuple[Grid, ...]:
+
+def _grids(setting: _Setting, found: Comparison, decisive: Sequence[str], own: Measured) -> tuple[Grid, ...]:
     """Tables over alpha and duration, one per decisive metric."""
     alphas, factors = setting.choices.alphas, setting.choices.factors
-    tables = [setting.rows(factor, decisive) for factor in factors] if decisive else []
+    tables = [setting.rows(factor, decisive, own) for factor in factors] if decisive else []
     names = dict.fromkeys(name for _, baselines in tables for name in baselines)  # a short move has no shaped baseline
     steps = [name for name, role in found.roles.items() if role is Role.STEP]
     steps += [name for name, plan in setting.baselines(setting.experiment.waypoints).items() if _is_step(plan)]

@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan.simulation import Event, Occurrence
+from ctrlplan.simulation.events import Watched, crossings
 
 METHODS = ("exact", "compiled", "python")
 ALLOWED = {"exact": 1e-12, "compiled": 1e-7, "python": 1e-7}
@@ -367,3 +368,44 @@ def test_bad_events_of_a_run(events, error, match, method):
 def test_an_event_alone_is_no_sequence():
     with pytest.raises(TypeError, match="events must be"):
         cp.simulate(LAG, T, 1.0, events=Event("y", high=0.5))
+
+
+# Roots between two samples
+
+
+def watched(value):
+    """Crossings of 0 by a function of time between two samples, and the number of its values."""
+    times, seen = np.array([0.0, 1.0]), []
+
+    def at(k, t):
+        seen.append(t)
+        return float(value(t))
+
+    entry = Watched("s", lambda snapshot: snapshot.t, -math.inf, 0.0)
+    return crossings(entry, times, np.array([float(value(t)) for t in times]), at), len(seen)
+
+
+@pytest.mark.parametrize(
+    ("value", "time"),
+    [
+        (lambda t: t - 0.3, 0.3),
+        (lambda t: t**3 - 0.2, 0.2 ** (1 / 3)),
+        (lambda t: math.tanh(40 * (t - 0.7)), 0.7),
+        (lambda t: math.exp(9 * t) - 50.0, math.log(50.0) / 9),
+        (lambda t: t - 0.9 if t < 0.8 else 5 * (t - 0.8) - 0.1, 0.82),
+        (lambda t: -1.0 + 0.1 * t if t < 1.0 else 4e4, 1.0),
+        (lambda t: -1.0 if t < 0.6 else 2.0, 0.6),
+    ],
+    ids=["line", "cubic", "tanh", "exponential", "kink", "jump at the sample", "jump between samples"],
+)
+def test_roots_between_two_samples(value, time):
+    found, _ = watched(value)
+    assert [o.kind for o in found] == ["above"]
+    assert abs(found[0].time - time) <= 2e-12
+    assert value(found[0].time) >= 0.0
+
+
+def test_few_values_locate_a_crossing():
+    """A smooth crossing is found by secants, a jump at a sample by a value just before it."""
+    assert watched(lambda t: math.exp(t) - 2.0)[1] <= 8
+    assert watched(lambda t: -1.0 + 0.1 * t if t < 1.0 else 4e4)[1] <= 6

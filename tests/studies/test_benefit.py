@@ -711,3 +711,25 @@ def test_rounding_beside_the_scale_is_no_defeat():
     assert tied.marks() == [[""]]
     lost = Grid("Overshoot", "%", np.ones(1), np.ones(1), np.array([[3e-3]]), {"one": np.zeros(1)}, scale=100.0)
     assert lost.marks() == [["worse"]]
+
+
+def test_no_plan_is_run_twice():
+    """Baselines and planned reference at the duration of the waypoints are in the comparison and in the tables."""
+    ran = []
+
+    def build(name, plan):
+        ran.append((name, plan.end))
+        source = cp.create_source_iosystem(plan, 0, suffix="_ref")
+        inside = ct.ss(loop(100.0), inputs="y_ref", outputs=["y", "u"])
+        return ct.interconnect([source, inside], inputs=0, outputs=["y", "u"])
+
+    points = [cp.Waypoint.from_jets(w.time, y=[w.position[0], 0.0, 0.0]) for w in MOVE]
+    found = worth(build, points, TIMES, alpha=1.0, mode=(20.0, 0.1), **TABLES)
+    own = len(found.comparison.plans)
+    assert len(ran) == own + 2 + (3 + own - 1)  # then alpha = 0 and 3, then all of the other duration
+    for grid in found.grids:
+        row = int(np.flatnonzero(grid.durations == 1.0)[0])
+        key = next(k for k, m in found.comparison.measures.items() if m.title == grid.title)
+        assert grid.values[row, 1] == found.comparison.metrics["trigonometric"][key]
+        for name, values in grid.baselines.items():
+            assert values[row] == found.comparison.metrics[name][key] or math.isnan(values[row])
