@@ -237,6 +237,7 @@ def test_growth_of_what_uses_a_plan(benchmark, capsys, tmp_path):
         rows.setdefault("memory", []).append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         at, one = np.linspace(plan.start, plan.end, 2 * n), plan.select(["y1"])
+        points = plan.waypoints
         work = {
             "retime": lambda plan=plan: plan.retime(2.0 * plan.duration),
             "save": lambda plan=plan: plan.save(tmp_path / "plan.json"),
@@ -244,6 +245,7 @@ def test_growth_of_what_uses_a_plan(benchmark, capsys, tmp_path):
             "jet": lambda plan=plan, at=at: plan.jet(at, 2),
             "extrema": lambda plan=plan: plan.extrema(1),
             "margins": lambda plan=plan: cp.margins(plan, {"velocity": 1e9}),
+            "optimum": lambda points=points: cp.optimize_waypoints(points, alpha=1.0),
             "source": lambda plan=plan, at=at, n=n: [
                 cp.create_source_iosystem(plan).output(time, [], []) for time in at[:: n // 50].tolist()
             ],
