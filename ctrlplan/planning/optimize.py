@@ -380,14 +380,14 @@ class _Segments:
     """One spline per segment."""
 
     def __init__(self, durations: Array, alpha: float, order: int, derivative: int) -> None:
-        self.root = _segment_root(alpha, order, derivative)
+        self.root, self.changing = _segment_roots(alpha, order, derivative)
         self.derivative = derivative
         self.durations = durations
-        self.orders = np.tile(np.arange(order + 1), 2)
-        powers = [np.ones_like(self.durations)]
-        while len(powers) <= order:
-            powers.append(powers[-1] * self.durations)
-        self.powers = np.concatenate([powers, powers])  # (nentries, nsegments)
+        powers = np.ones((2, order + 1, self.durations.size))
+        for k in range(order):
+            np.multiply(powers[0, k], self.durations, out=powers[0, k + 1])
+        powers[1] = powers[0]
+        self.powers = powers.reshape(-1, self.durations.size)  # (nentries, nsegments)
 
     def solve(self, group: _Group, estimate: bool = False) -> _Solution:
         """Optimum of axes with the same pattern of prescribed entries."""
@@ -397,7 +397,7 @@ class _Segments:
         else:
             left, right, unique = self._chained(group) or self._dense(group)
         data = self._data(left, right)
-        value, change = self.root @ data, self.root @ (data * self.orders[:, None])
+        value, change = self.root @ data, self.changing @ data
         power = 1 - 2 * self.derivative
         square, both = (value * value).sum(axis=1), (value * change).sum(axis=1)
         weight = self.durations**power
@@ -515,11 +515,12 @@ class _Whole:
 
 
 @lru_cache(maxsize=256)
-def _segment_root(alpha: float, order: int, derivative: int) -> Array:
-    """Matrix R with int_0^1 (y^(derivative))^2 = |R d|^2, d the jet at 0, then that at 1."""
+def _segment_roots(alpha: float, order: int, derivative: int) -> tuple[Array, Array]:
+    """Matrix R with int_0^1 (y^(derivative))^2 = |R d|^2, d the jet at 0, then that at 1; R times the orders of d."""
     given = tuple(range(order + 1))
     system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
-    return readonly(np.linalg.qr(system.squared_samples(derivative) @ _fitted(system, np.eye(system.size))).R)
+    root = np.linalg.qr(system.squared_samples(derivative) @ _fitted(system, np.eye(system.size))).R
+    return readonly(root), readonly(root * np.array([*given, *given]))
 
 
 def _fitted(system: NewtonSystem, entries: Array) -> Array:
