@@ -804,7 +804,9 @@ def _places(apart: NDArray[np.bool_], orders: NDArray[np.intp], waypoints: NDArr
     zeros[:, 1:] = np.cumsum(~apart[:, :-1], axis=1)
     left = orders - zeros.T[:, waypoints]
     found = (left * nwaypoints + waypoints) * (count + 1) + np.arange(count)[:, None]
-    return readonly(np.where(left >= 0, found, nwaypoints * (count + 1)))
+    found = np.where(left >= 0, found, nwaypoints * (count + 1))
+    found.flags.writeable = False
+    return found
 
 
 @lru_cache(maxsize=256)
