@@ -144,6 +144,8 @@ class NewtonSystem(Fields):
     _nodes: Array
     _first: Array
     _second: Array
+    _moments: list[float]  # nodes, each waypoint once
+    _pairs: _Pairs
 
     def __init__(
         self,
@@ -167,8 +169,11 @@ class NewtonSystem(Fields):
         phase, fold = _top_harmonic(alpha, size, mean, gamma)
         nodes = times.take(pattern.waypoints)
         beyond = times[:, None] - nodes if apart is None else apart.take(pattern.waypoints, axis=1)
+        pairs = pattern.pairs
         if size > count:
             spare = _spare_nodes(mean, size - count)
+            moments = [*moments, *spare.tolist()]
+            pairs = _pairs([*pattern.at, *range(len(times), len(moments))])
             nodes, beyond = np.concatenate([nodes, spare]), np.hstack([beyond, times[:, None] - spare])
         self._set_fields(
             alpha=alpha,
@@ -185,6 +190,8 @@ class NewtonSystem(Fields):
             _nodes=readonly(nodes),
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
+            _moments=moments,
+            _pairs=pairs,
         )
         if not effective(alpha) and apart is None and size == count and pattern.places is not None:
             collocation = _products_at_nodes(beyond, pattern.apart, pattern.places, max(pattern.keys))
@@ -450,10 +457,10 @@ class NewtonSystem(Fields):
         if not effective(self.alpha):
             gaps = [u - node for node in self._nodes_backwards]
             return [polynomial_series(gaps, column, order) for column in columns]
-        pairs, places = self._pairs
+        moments, (pairs, places) = self._moments, self._pairs
         if self._fold:
             columns = [[*column, self._fold * column[-1]] for column in columns]
-        distinct = [pair_series(self.alpha, u - first, u - second, max(order, 3)) for first, second in pairs]
+        distinct = [pair_series(self.alpha, u - moments[i], u - moments[j], max(order, 3)) for i, j in pairs]
         factors = [distinct[place] for place in places]
         return [trigonometric_series(factors, column, order) for column in columns]
 
@@ -461,14 +468,6 @@ class NewtonSystem(Fields):
     def _nodes_backwards(self) -> list[float]:
         """Nodes of the products, the last one first."""
         return self._nodes[self.size - 2 :: -1].tolist() if self.size > 1 else []
-
-    @cached_property
-    def _pairs(self) -> tuple[list[tuple[float, float]], list[int]]:
-        """Different pairs of nodes, and the place of each pair among them, the last one first."""
-        pairs: dict[tuple[float, float], int] = {}
-        every = zip(self._first.tolist(), self._second.tolist(), strict=True)
-        places = [pairs.setdefault(pair, len(pairs)) for pair in every]
-        return list(pairs), places[::-1]
 
     def _across(self, times: Sequence[float], duration: float) -> float:
         """Minimum distance on the circle from a waypoint near the end to one near the start, without the two ends."""
@@ -740,6 +739,17 @@ def _grid(count: int) -> Array:
     return readonly(np.linspace(0.0, 1.0, count))
 
 
+_Pairs = tuple[list[tuple[int, int]], list[int]]
+"""Different pairs of nodes, and the place of each pair among them, the last one first."""
+
+
+def _pairs(nodes: Sequence[int]) -> _Pairs:
+    """Pairs of nodes, given by their numbers."""
+    pairs: dict[tuple[int, int], int] = {}
+    places = [pairs.setdefault(pair, len(pairs)) for pair in zip(nodes[::2], nodes[1::2], strict=False)]
+    return list(pairs), places[::-1]
+
+
 class _Pattern(NamedTuple):
     """Constraints in the order of the Newton form.
 
@@ -759,6 +769,8 @@ class _Pattern(NamedTuple):
         Number of constraints of ends that coincide.
     is_short : int
         Number of waypoints if they are few and begin with their positions, else 0.
+    pairs : _Pairs
+        Pairs of waypoints, as nodes.
     apart : ndarray of bool, shape (nwaypoints, nconstraints)
         Whether a node is not at a waypoint.
     places : ndarray of int, shape (nconstraints, nconstraints), or None
@@ -775,6 +787,7 @@ class _Pattern(NamedTuple):
     hermite: bool
     lead: int
     is_short: int
+    pairs: _Pairs
     apart: NDArray[np.bool_]
     places: NDArray[np.intp] | None
 
@@ -794,7 +807,8 @@ def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet:
     is_short = number if 2 <= number <= _SHORT and keys[:number] == (0,) * number else 0
     anchor = int((orders == 0).argmax())
     places = _places(apart, orders, waypoints) if len(at) <= _STORED and max(keys) <= _ELEMENTARY else None
-    return _Pattern(at, keys, waypoints, orders, positions, anchor, hermite, len(first), is_short, apart, places)
+    lead = len(first)
+    return _Pattern(at, keys, waypoints, orders, positions, anchor, hermite, lead, is_short, _pairs(at), apart, places)
 
 
 def _places(apart: NDArray[np.bool_], orders: NDArray[np.intp], waypoints: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -804,7 +818,9 @@ def _places(apart: NDArray[np.bool_], orders: NDArray[np.intp], waypoints: NDArr
     zeros[:, 1:] = np.cumsum(~apart[:, :-1], axis=1)
     left = orders - zeros.T[:, waypoints]
     found = (left * nwaypoints + waypoints) * (count + 1) + np.arange(count)[:, None]
-    return readonly(np.where(left >= 0, found, nwaypoints * (count + 1)))
+    found = np.where(left >= 0, found, nwaypoints * (count + 1))
+    found.flags.writeable = False
+    return found
 
 
 @lru_cache(maxsize=256)

@@ -213,6 +213,9 @@ def sample_segments(
             finite &= _sample_grouped(times, rows_of, entries, part[order], left, alpha, used, counts[used], found)
             back = np.empty_like(order)
             back[order] = np.arange(order.size)
+            if part.size == t.size:
+                found.take(back, axis=2, out=out, mode="clip")
+                continue
             for values, target in zip(found.reshape(-1, part.size), out.reshape(-1, t.size), strict=True):
                 values.take(back, out=target[begin : begin + part.size], mode="clip")  # without a copy
     return finite
@@ -287,12 +290,12 @@ def _sample_grouped(
         bounds = [0, *counts.cumsum().tolist()]
         evaluate(list(map(Part, rows, bounds, bounds[1:], starts.tolist(), durations.tolist())), t, out, alpha)
     where = (t == (ends if left else starts).repeat(counts)).nonzero()[0]
-    at = segments.repeat(counts)[where] + left
-    if segments[-1] == times.size - 2 and not left:  # the end belongs to the last segment
-        more = (t[-counts[-1] :] == ends[-1]).nonzero()[0] + (t.size - counts[-1])
-        where, at = np.append(where, more), np.append(at, np.full(more.size, times.size - 1))
     if where.size:
-        place_entries(entries[at], where, out)
+        place_entries(entries[segments.repeat(counts)[where] + left], where, out)
+    if segments[-1] == times.size - 2 and not left:  # the end belongs to the last segment
+        where = (t[-counts[-1] :] == ends[-1]).nonzero()[0] + (t.size - counts[-1])
+        if where.size:
+            place_entries(entries[np.full(where.size, times.size - 1)], where, out)
     return finite
 
 
@@ -322,7 +325,7 @@ class Collocation(NamedTuple):
     products: Array
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)
 def collocation(alpha: float, size: int) -> Collocation:
     """Points for polynomials of `size` coefficients, or for trigonometric polynomials of degree size // 2.
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._checks import checked_finite, default_labels, new_numbers
 from ctrlplan._display import Displayed, Part, Table, counted, number, shortened
 from ctrlplan._types import Data
-from ctrlplan.trajectories.common import Array, readonly, times_powers
+from ctrlplan.trajectories.common import Array, are_finite, readonly, times_powers
 from ctrlplan.trajectories.fields import Fields
 
 ENTRIES = ("position", "velocity", "acceleration", "jerk", "snap")
@@ -149,7 +149,7 @@ class Waypoint(Displayed, Fields):
         return self
 
     def _set(self, time: float, jet: Array, labels: tuple[str, ...] | None) -> None:
-        complete = bool(np.isfinite(jet).all())
+        complete = are_finite(jet) or bool(np.isfinite(jet).all())
         if not complete and np.isinf(jet).any():
             order, axis = np.argwhere(np.isinf(jet))[0]
             name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"

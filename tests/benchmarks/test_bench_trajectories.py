@@ -172,37 +172,52 @@ KINDS = {
 }
 
 
+def pair_of_plan_and_horner(kind, count, naxes, size):
+    """A plan through random waypoints, and Horner's method of random coefficients."""
+    times = np.arange(count) + RNG.uniform(0.0, 0.1, count)
+    plan = KINDS[kind](
+        [Waypoint(t, *jet) for t, jet in zip(times.tolist(), RNG.normal(size=(count, 3, naxes)), strict=True)]
+    )
+    return plan, horner(RNG.normal(size=(naxes, size)).tolist(), 0.0, plan.duration)
+
+
 @pytest.mark.benchmark(group="one time")
 @pytest.mark.parametrize("naxes", [1, 2, 3])
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_time_next_to_horner(benchmark, capsys, kind, naxes):
-    """jet(t, 3) at a float; peer: Horner's method of as many coefficients, written by hand. Goal: at most 6."""
+    """jet(t, 3) at a float; peer: Horner's method of as many coefficients, written by hand. Goal: at most 6.
+
+    The first call, of plans with waypoints at other times, next to the first call of the peer with other numbers.
+    """
     cells = []
     for count in (2, 4):
-        jets = RNG.normal(size=(count, 3, naxes))
-        given = [Waypoint(float(i), *jet) for i, jet in enumerate(jets)]
-        fresh = [KINDS[kind](given) for _ in range(50)]
-        plan, size = fresh[0], 6 if kind == "piecewise" else 3 * count
-        peer = horner(RNG.normal(size=(naxes, size)).tolist(), 0.0, plan.duration)
+        size = 6 if kind == "piecewise" else 3 * count
+        plan, peer = pair_of_plan_and_horner(kind, count, naxes, size)
         exact = plan.jet(np.array([0.7, 0.2]), 3)[..., 0]
         assert np.abs(plan.jet(0.7, 3) - exact).max() <= 1e-12 * np.abs(exact).max()
         times = []
         for _ in range(7):
             row = []
-            for function in (plan.jet, peer):
-                arguments = (0.7, 3) if function is not peer else (0.7,)
+            for function in (lambda plan=plan: plan.jet(0.7, 3), lambda peer=peer: peer(0.7)):
                 begin = process_time()
                 for _ in range(1000):
-                    function(*arguments)
+                    function()
                 row.append((process_time() - begin) / 1000)
             times.append(row)
-        begin = process_time()
-        for new in fresh[1:]:
+        first = []
+        for _ in range(200):
+            new, other = pair_of_plan_and_horner(kind, count, naxes, size)
+            begin = process_time()
             new.jet(0.7, 3)
-        first = (process_time() - begin) / len(fresh[1:])
-        own, other = (1e6 * median(column) for column in zip(*times, strict=True))
+            middle = process_time()
+            other(0.7)
+            first.append((middle - begin, process_time() - middle))
+        texts = []
+        for rows in (times, first):
+            own, other = (1e6 * median(column) for column in zip(*rows, strict=True))
+            texts.append(f"{own:.1f} / {other:.2f} us = {own / other:.1f}")
         ratio = median(a / b for a, b in times)
-        cells.append(f"{count} waypoints {own:.1f} / {other:.2f} us = {ratio:.1f}, first call {1e6 * first:.0f} us")
+        cells.append(f"{count} waypoints {texts[0]}, first call {texts[1]}")
     benchmark.extra_info["ratio"] = ratio
     benchmark.pedantic(lambda: plan.jet(0.7, 3), rounds=5, iterations=100)
     with capsys.disabled():
