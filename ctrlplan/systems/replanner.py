@@ -259,10 +259,10 @@ class _Horizons:
         return self._end if self.shrinking else t + self.whole.horizon
 
     def at(self, t: float) -> Transition | None:
-        """Transition of a fit at a time; None before the plan or too close to its end."""
+        """Transition of a fit at a time not too close to the end of the plan; None before the plan."""
         if not self.shrinking:
             return self.whole
-        if t < self._start or self.too_short(t):
+        if t < self._start:
             return None
         return transition(self.order, self._end - t, self.rate * (self._end - t))
 
@@ -422,7 +422,7 @@ class _Correction(SampledBlock):
             miss = self._distance(t, state, goal) if stopped else self._miss(t, state, goal) if goal else 0.0
             after[_UNREACHABLE] = 1.0 if late and miss > _MATTERS else 0.0
             due = due or miss > _ROUNDING
-        found = self._horizons.at(t) if due else None
+        found = self._horizons.at(t) if due and not late else None
         if found is None:
             return after
         if self._again is not None and not stopped and self._is_next(t, state):
