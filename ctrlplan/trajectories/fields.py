@@ -23,7 +23,7 @@ class Fields(Frozen):
             If a name is not annotated in the class or one of its bases, or is
             set already.
         """
-        declared = _declared(type(self))
+        declared = _declared(type(self).__mro__)
         if not values.keys() <= declared:
             unknown = values.keys() - declared
             raise AttributeError(
@@ -41,7 +41,7 @@ class Fields(Frozen):
 
     def _with_fields(self, **values: Any) -> Self:
         """Copy with some fields changed and without cached values."""
-        declared = _declared(type(self))
+        declared = _declared(type(self).__mro__)
         fields = {name: value for name, value in self.__dict__.items() if name in declared}
         found = type(self).__new__(type(self))
         found._set_fields(**(fields | values))
@@ -49,11 +49,11 @@ class Fields(Frozen):
 
 
 @lru_cache(maxsize=1024)
-def _declared(cls: type) -> frozenset[str]:
+def _declared(classes: tuple[type, ...]) -> frozenset[str]:
     """Names annotated in a class and its bases, without class variables."""
     return frozenset(
         name
-        for base in cls.__mro__
+        for base in classes
         for name, annotation in get_annotations(base).items()
         if not str(annotation).removeprefix("typing.").startswith("ClassVar")
     )
