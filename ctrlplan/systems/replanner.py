@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from operator import sub
 from typing import Literal, NamedTuple, get_args
 
 import control as ct
@@ -226,10 +227,11 @@ class _Horizons:
             alpha = own if own < 2.0 * math.pi else 0.0
         self.whole = Transition(order, whole, alpha)
         self.period, self.order, self.rate = period, order, self.whole.rate
-        # Maps from coefficients to jets one period later, and from jets to coefficients with the goal reached at rest,
-        # if they are constant.
+        # Maps from coefficients to jets one period later, from jets to coefficients with the goal reached at rest, and
+        # from coefficients to those of such a fit one period later, if they are constant.
         self.step: Array | None = None
         self.home: Array | None = None
+        self.again: Array | None = None
         self._start, self._end = plan.start, plan.end
         if self.shrinking:
             self._minimum = _minimum_horizon(min_horizon, period, whole)
@@ -240,6 +242,7 @@ class _Horizons:
             )
         self.step, unit = self.whole.evaluation(period, order), np.eye(order + 1)
         self.home = self.whole.coefficients(np.concatenate([unit, np.zeros_like(unit)]))
+        self.again = self.home @ self.step
         radius = self.whole.radius(period)
         if not radius < 1.0:
             raise ValueError(
@@ -256,10 +259,10 @@ class _Horizons:
         return self._end if self.shrinking else t + self.whole.horizon
 
     def at(self, t: float) -> Transition | None:
-        """Transition of a fit at a time; None before the plan or too close to its end."""
+        """Transition of a fit at a time not too close to the end of the plan; None before the plan."""
         if not self.shrinking:
             return self.whole
-        if t < self._start or self.too_short(t):
+        if t < self._start:
             return None
         return transition(self.order, self._end - t, self.rate * (self._end - t))
 
@@ -383,8 +386,11 @@ class _Correction(SampledBlock):
         self._positions = dict(limits).get(0)
         self._passed, self._naxes, self._order = signals.passed, naxes, order
         self._seen, self._period = signals.measurements, horizons.period
+        self._again = horizons.again if signals.measured is None and not ngoals else None
         self._final = plan.final.tolist()
         self._goal, self._fitted, self._goals = slice(5, 5 + ngoals), fitted, signals.goals
+        inputs = np.arange(len(signals.inner) + len(signals.outer))
+        self._goal_inputs = np.concatenate([inputs[:0], *(inputs[rows] for rows in self._goals)])
         self._stop, self._stopped = stop, slice(fitted.stop, len(states))
         extrema = plan.extrema()
         self._range = float((extrema.maximum - extrema.minimum).max())
@@ -394,6 +400,7 @@ class _Correction(SampledBlock):
         if horizons.shrinking:
             arrival = _without_rounding(plan.jet(plan.end, order), np.array(self._scales)[:, None], self._range)
             self._arrival = arrival.tolist()
+        self._arrival_row = [value for row in self._arrival for value in row]
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
         """States after a fit; unchanged if none is due."""
@@ -409,22 +416,26 @@ class _Correction(SampledBlock):
         if not finite:
             return after
         goal = [values[rows] for rows in self._goals]
-        miss = self._miss(t, state, goal) if goal else 0.0
-        moved = miss > _ROUNDING
-        if stopped:
-            miss = self._distance(t, state, goal)
-        after[_UNREACHABLE] = 1.0 if miss > _MATTERS and self._horizons.too_short(t) else 0.0
-        found = self._horizons.at(t) if moved or stopped or self._is_due(t, state, values) else None
+        due, late = stopped or self._is_due(t, state, values), self._horizons.too_short(t)
+        after[_UNREACHABLE] = 0.0
+        if late or not due:
+            miss = self._distance(t, state, goal) if stopped else self._miss(t, state, goal) if goal else 0.0
+            after[_UNREACHABLE] = 1.0 if late and miss > _MATTERS else 0.0
+            due = due or miss > _ROUNDING
+        found = self._horizons.at(t) if due and not late else None
         if found is None:
             return after
-        coefficients = self._coefficients(found, self._deviation(t, state, u, values), goal)
+        if self._again is not None and not stopped and self._is_next(t, state):
+            coefficients = self._again.dot(x[self._fitted].reshape(-1, self._naxes))
+        else:
+            coefficients = self._coefficients(found, self._deviation(t, x, state, u, values), goal)
         if self._limits and not self._within_limits(t, found, coefficients, goal):
             after[_UNREACHABLE] = 1.0
             return after
         after[_START], after[_END], after[_UNREACHABLE] = t, self._horizons.end(t), 0.0
-        after[_FITS] += 1.0
+        after[_FITS] = state[_FITS] + 1.0
         if goal:
-            after[self._goal] = [value for row in goal for value in row]
+            after[self._goal] = u[self._goal_inputs]
         after[self._fitted] = coefficients.ravel()
         if stopped:
             after[self._stopped] = 0.0
@@ -434,12 +445,9 @@ class _Correction(SampledBlock):
         """Coefficients of the correction from a jet, in one list, to the change of the goal."""
         if not goal and found is self._horizons.whole and self._horizons.home is not None:
             return self._horizons.home.dot(np.array(begins).reshape(-1, self._naxes))
-        ends = [
-            value - arrival
-            for row, own in zip(_extrapolated(goal, found.horizon), self._arrival, strict=False)
-            for value, arrival in zip(row, own, strict=True)
-        ]
-        return found.coefficients_of_row([*begins, *ends, *[0.0] * (len(begins) - len(ends))])
+        changes = map(sub, itertools.chain.from_iterable(_extrapolated(goal, found.horizon)), self._arrival_row)
+        row = [*begins, *changes]
+        return found.coefficients_of_row(row + [0.0] * (2 * len(begins) - len(row)))
 
     def _is_stopped(self, x: list[float]) -> bool:
         """Whether the reference stops or has stopped."""
@@ -463,8 +471,8 @@ class _Correction(SampledBlock):
     def _is_due(self, t: float, x: list[float], values: list[float]) -> bool:
         """Whether a fit is due though the goal has not moved."""
         if self._trigger.kind == "deviation":
-            own = self._jets(t, x, 0)
-            off = [values[i] - values[j] - value for (i, j), value in zip(self._seen, own, strict=False)]
+            own = self._corrections(t, x, 0)
+            off = [values[i] - values[j] - value for (i, j), (value,) in zip(self._seen, own, strict=False)]
             return math.hypot(*off) > self._trigger.threshold
         # From the reference to the same goal over the remaining time the fit would be the same plan.
         return self._trigger.kind == "period" and (self._signals.measured is not None or not self._horizons.shrinking)
@@ -488,16 +496,18 @@ class _Correction(SampledBlock):
         )
         return far / size if size else math.inf if far else 0.0
 
-    def _deviation(self, t: float, x: list[float], u: Array, values: list[float]) -> list[float]:
+    def _deviation(self, t: float, x: Array, state: list[float], u: Array, values: list[float]) -> list[float]:
         """Jet at the start of a fit minus that of the plan: all axes of one derivative after another."""
         seen = [values[i] - values[j] for i, j in self._seen]
         if self._signals.measured == self._order:
             return seen
-        if self._is_stopped(x):
+        if self._is_stopped(state):
             planned = u[: len(self._signals.inner)].reshape(self._naxes, -1)[:, : self._order + 1].T
-            own = (self._stop_jets(t, x, self._order) - planned).ravel().tolist()
+            own = (self._stop_jets(t, state, self._order) - planned).ravel().tolist()
+        elif self._horizons.step is not None and self._is_next(t, state):
+            own = self._horizons.step.dot(x[self._fitted].reshape(-1, self._naxes)).ravel().tolist()
         else:
-            own = self._jets(t, x, self._order)
+            own = [value for row in zip(*self._corrections(t, state, self._order), strict=True) for value in row]
         return seen + own[len(seen) :] if seen else own
 
     def _within_limits(self, t: float, found: Transition, coefficients: Array, goal: list[list[float]]) -> bool:
@@ -561,13 +571,9 @@ class _Correction(SampledBlock):
             found = [value * (1.0 - stopped) + held * stopped for value, held in zip(found, jets, strict=True)]
         return np.array(found)
 
-    def _jets(self, t: float, x: list[float], order: int) -> list[float]:
-        """Jet of the correction: all axes of one derivative after another."""
-        step = self._horizons.step
-        if step is not None and order == self._order and abs(t - x[_START] - self._period) <= 1e-15 * abs(t):
-            found: list[float] = step.dot(np.array(x[self._fitted]).reshape(-1, self._naxes)).ravel().tolist()
-            return found
-        return [value for row in zip(*self._corrections(t, x, order), strict=True) for value in row]
+    def _is_next(self, t: float, x: list[float]) -> bool:
+        """Whether the last fit was one period before."""
+        return abs(t - x[_START] - self._period) <= 1e-15 * abs(t)
 
     def _corrections(self, t: Value, x: Value, order: int) -> list[list[Value]]:
         """Jets of the correction axis by axis, numeric or symbolic."""

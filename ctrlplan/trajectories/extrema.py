@@ -160,7 +160,7 @@ def carry_extrema(plan: Trajectory, moved: Trajectory, rate: float) -> None:
 
 
 def search_extrema(plan: Trajectory, orders: Iterable[int]) -> None:
-    """Search the extrema of several derivatives together, for `derivative_extrema`, if places of all segments are known.
+    """Search extrema of several derivatives together, for `derivative_extrema`, if places of all segments are known.
 
     All of them are evaluated at the stationary points of each.
     """

@@ -72,10 +72,8 @@ class Transition(Displayed, Fields):
     horizon: float
     alpha: float
     rate: float
-    _system: NewtonSystem
-    _rows: NDArray[np.intp]
+    _family: _Family
     _matrix: Array | None  # from jets, the position at the end relative to that at the start, to coefficients
-    _powers: Array  # of the horizon
 
     def __init__(self, order: int, horizon: float, alpha: float = 0.0) -> None:
         order = checked_count(order, "order")
@@ -87,18 +85,13 @@ class Transition(Displayed, Fields):
             raise ValueError(
                 f"powers of the horizon must stay within floating point, got {horizon:g} s to the power {highest:g}"
             )
-        powers = horizon**family.exponents
         self._set_fields(
             order=order,
             horizon=horizon,
             alpha=alpha,
             rate=alpha / horizon,
-            _system=family.system,
-            _rows=family.rows,
-            _matrix=None
-            if family.matrix is None
-            else readonly(family.matrix * powers[family.jet_orders] / powers[:, None]),
-            _powers=readonly(powers),
+            _family=family,
+            _matrix=None if family.matrix is None else readonly(family.matrix * horizon**family.exponents),
         )
 
     def _describe(self) -> Iterator[Part]:
@@ -137,26 +130,30 @@ class Transition(Displayed, Fields):
         jets : sequence of float, length 2 (order + 1) naxes
             All axes of one derivative after another, at the start, then at the end.
         """
-        naxes, own = len(jets) // len(self._rows), list(jets)
+        first = len(jets) // 2
+        naxes = first // (self.order + 1)
         if self._matrix is None:
-            data = np.array(own).reshape(-1, naxes)[self._rows]
-            scale = self._powers[self._system.order_index] / FACTORIALS[self._system.order_index]
-            fitted = self._system.fitted(data, (0.0, self.horizon), self.horizon, data * scale[:, None])
-            return fitted * self._time_scale
+            return self._carefully(np.array(jets).reshape(-1, naxes)[self._family.rows])
         # Positions relative to the start, as in `NewtonSystem.coefficients`.
-        first = (self.order + 1) * naxes
+        own = list(jets)
         for axis in range(naxes):
             own[first + axis] -= own[axis]
         return self._matrix.dot(np.array(own).reshape(-1, naxes))
 
+    def _carefully(self, data: Array) -> Array:
+        """Coefficients with a check of their accuracy, from jets in the order of the system."""
+        system = self._family.system
+        scale = self.horizon**system.order_index / FACTORIALS[system.order_index]
+        return system.fitted(data, (0.0, self.horizon), self.horizon, data * scale[:, None]) * self._time_scale
+
     @property
     def _time_scale(self) -> Array:
         """Inverse powers of the horizon, shape (2 (order + 1), 1)."""
-        return np.asarray((1.0 / self._powers)[:, None])
+        return np.asarray((1.0 / self.horizon ** np.arange(2.0 * self.order + 2.0))[:, None])
 
     def jet(self, coefficients: Array, s: Array, order: int) -> Array:
         """Jet (order + 1, naxes, ntime) at times s [s] after the start."""
-        taylor = self._system.taylor(np.asarray(s, dtype=float) / self.horizon, order)
+        taylor = self._family.system.taylor(np.asarray(s, dtype=float) / self.horizon, order)
         values = np.einsum("mkt,ma->kat", taylor, coefficients / self._time_scale)
         return values * derivative_scale(self.horizon, order)[:, None, None]
 
@@ -168,7 +165,7 @@ class Transition(Displayed, Fields):
         """
         if self.alpha:
             return None
-        matrix = bernstein(self._system, nu)
+        matrix = bernstein(self._family.system, nu)
         return np.asarray(matrix.reshape(-1, matrix.shape[-1]) * (self.horizon**-nu / self._time_scale[:, 0]))
 
     def evaluation(self, s: float, order: int) -> Array:
@@ -199,9 +196,8 @@ class _Family(NamedTuple):
 
     system: NewtonSystem
     rows: NDArray[np.intp]  # of the jets at both ends, in the order of the system
-    exponents: Array
-    jet_orders: NDArray[np.intp]  # of the jets at both ends
-    matrix: Array | None  # from jets to coefficients; None if that loses digits
+    matrix: Array | None  # from jets to coefficients over a horizon of 1; None if that loses digits
+    exponents: Array  # of the horizon in the entries of the matrix
 
 
 @lru_cache(maxsize=4096)
@@ -216,7 +212,7 @@ def _family(order: int, alpha: float) -> _Family:
         # A position at both ends is that of a constant.
         matrix[:, 0] = np.eye(len(rows))[0]
         matrix /= FACTORIALS[orders]
-    return _Family(system, rows, np.arange(2.0 * order + 2.0), orders, matrix)
+    return _Family(system, rows, matrix, orders - np.arange(2.0 * order + 2.0)[:, None])
 
 
 @lru_cache(maxsize=4096)
