@@ -57,6 +57,15 @@ class Harmonics(NamedTuple):
     rate: float
     coefficients: Array
 
+    def __call__(self, s: float) -> Array:
+        """All signals at one time after `left`, shape (nsignals,)."""
+        c1, s1 = math.cos(self.rate * s), math.sin(self.rate * s)
+        cosine, sine, terms = c1, s1, [1.0]
+        for _ in range(self.coefficients.shape[1] // 2):
+            terms += (cosine, sine)
+            cosine, sine = cosine * c1 - sine * s1, sine * c1 + cosine * s1
+        return np.asarray(self.coefficients.dot(terms))
+
     @classmethod
     def fitted(
         cls, series: Series, rate: float, count: int, accuracy: float, rounding: Array | float
@@ -98,10 +107,13 @@ class Series:
         width = self.coefficients.shape[1]
         if width == 1:
             return self.coefficients[:, 0]
-        u = (2.0 * t - self.left - self.right) / (self.right - self.left)
         # A trial step of a solver may end slightly beyond the segment.
-        angle = math.acos(min(1.0, max(-1.0, u)))
-        values = self.coefficients @ np.cos(angle * _counts(width))
+        t = min(self.right, max(self.left, t))
+        if self.harmonics is not None:
+            values = self.harmonics(t - self.left)
+        else:
+            u = (2.0 * t - self.left - self.right) / (self.right - self.left)
+            values = self.coefficients @ np.cos(math.acos(min(1.0, max(-1.0, u))) * _counts(width))
         return np.asarray(np.minimum(np.maximum(values, self.low), self.high))
 
     def at(self, times: Array) -> Array:

@@ -82,6 +82,9 @@ def test_harmonics_of_a_trigonometric_plan():
         found = found + a[:, None] * np.cos(angle) + b[:, None] * np.sin(angle)
     expected = plan.jet(times, 2)[:, 0]
     assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
+    each = np.array([series(t) for t in times.tolist()]).T
+    assert np.abs(each - expected).max() <= 1e-13 * np.abs(expected).max()
+    np.testing.assert_array_equal(series(3.0 + 1e-9), series(3.0))
 
 
 def test_harmonics_that_cancel_are_not_used():
