@@ -41,6 +41,7 @@ _JUMP = 2.0  # multiple of both neighbouring slopes above which there is a jump
 _UNEVEN = 4.0  # ratio of adjacent intervals up to which few digits are lost in products of samples
 _ROUNDING = np.finfo(float).eps / 2  # of the terms of a cubic, up to which it is at a level
 _BLOCK = 2**14  # samples
+_STRETCH, _WINDOWS = 2**7, 2**7  # samples of a stretch of a signal; stretches that are looked at together
 LONG = 2**9  # samples, from which on one row costs more than the calls for it
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
@@ -227,16 +228,46 @@ class Bulges:
     def __init__(self, t: Array) -> None:
         step = np.diff(t)
         self._pace, self._width, self._share = 1.0 / step, 1.0 / (t[2:] - t[:-2]), step[1:-1] ** 2 / 4
+        self._starts = np.arange(0, t.size, _STRETCH)
+        # Of four samples of magnitude 1: both curvatures are at most 2 / (product of the adjacent steps).
+        self._largest = 1.0 + 1e-9 + float((step[1:-1] / (2 * np.minimum(step[:-2], step[2:]))).max(initial=0.0))
 
-    def beyond(self, f: Array, size: Array, level: Array, first: NDArray[np.intp] | None = None) -> Places:
+    def extrema(self, f: Array) -> tuple[Array, Array]:
+        """Return the minima and maxima of the samples of signals (nrows, ntime) by stretch, (nrows, nstretches)."""
+        return np.minimum.reduceat(f, self._starts, axis=1), np.maximum.reduceat(f, self._starts, axis=1)
+
+    def last_beyond(self, f: Array, level: Array, peaks: Array) -> NDArray[np.intp]:
+        """Return the last sample of each signal (nrows, ntime) whose magnitude exceeds a level, 0 if none does.
+
+        `peaks` are the magnitudes by stretch, (nrows, nstretches).
+        """
+        beyond = peaks > level[:, None]
+        stretch = self._starts.size - 1 - beyond[:, ::-1].argmax(axis=1)
+        at = np.minimum(self._starts[stretch, None] + np.arange(_STRETCH)[::-1], f.shape[1] - 1)
+        rows = np.arange(len(f))
+        place = (np.abs(f[rows[:, None], at]) > level[:, None]).argmax(axis=1)
+        return np.where(beyond.any(axis=1), at[rows, place], 0)
+
+    def beyond(
+        self,
+        f: Array,
+        size: Callable[[Array], Array],
+        level: Array,
+        peaks: Array,
+        first: NDArray[np.intp] | None = None,
+    ) -> Places:
         """Return the intervals in which the cubics of signals, or their magnitudes, may exceed a level.
 
         Parameters
         ----------
-        f, size : ndarray, shape (nrows, ntime)
-            The signals, and the signals or their magnitudes, which are compared with the level.
+        f : ndarray, shape (nrows, ntime)
+            The signals.
+        size : callable
+            Returns signals, or their magnitudes: what is compared with the level.
         level : ndarray, shape (nrows,)
             The level of each signal; none of its intervals are returned if it is nan.
+        peaks : ndarray, shape (nrows, nstretches)
+            Magnitudes of the signals by stretch.
         first : ndarray, shape (nrows,), optional
             First interval of each signal; default: 0. It and the last one, with no bound, are included.
 
@@ -245,24 +276,41 @@ class Bulges:
         rows, intervals : ndarray
             In order.
         """
-        slope = f[:, 1:] - f[:, :-1]
-        slope *= self._pace
+        ntime, first = f.shape[1], np.zeros(len(f), dtype=np.intp) if first is None else first
+        usable = np.flatnonzero(~np.isnan(level))
+        found = [usable * ntime + first[usable], usable * ntime + ntime - 2]
+        # Stretches of smaller samples are far below the level, also between samples; nan cannot be excluded.
+        large = ~(peaks * self._largest <= level[:, None]) & (self._starts + _STRETCH >= first[:, None])
+        rows, stretch = np.nonzero(large & ~np.isnan(level)[:, None])
+        for begin in range(0, rows.size, _WINDOWS):
+            own = rows[begin : begin + _WINDOWS]
+            window, interval = self._inside(f, size, level, own, stretch[begin : begin + _WINDOWS])
+            late = interval > first[own[window]]
+            found.append(own[window[late]] * ntime + interval[late])
+        return tuple(np.divmod(np.unique(np.concatenate(found)), ntime))
+
+    def _inside(
+        self,
+        f: Array,
+        size: Callable[[Array], Array],
+        level: Array,
+        rows: NDArray[np.intp],
+        stretch: NDArray[np.intp],
+    ) -> Places:
+        """Return those of the inner intervals with samples of some stretches, with the number of the stretch first."""
+        count = min(f.shape[1], _STRETCH + 6)
+        at = np.clip(self._starts[stretch] - 3, 0, f.shape[1] - count)[:, None] + np.arange(count)
+        samples = f[rows[:, None], at]
+        slope = samples[:, 1:] - samples[:, :-1]
+        slope *= self._pace[at[:, :-1]]
         d = slope[:, 1:] - slope[:, :-1]
-        d *= self._width
+        d *= self._width[at[:, :-2]]
         np.abs(d, out=d)
-        reach = np.maximum(d[:, :-1], d[:, 1:])
-        reach *= self._share
-        reach += np.maximum(size[:, 1:-2], size[:, 2:-1])
-        found = np.zeros(slope.shape, dtype=np.bool_)
-        found[:, 1:-1] = ~(reach <= level[:, None])  # nan is included, as it cannot be excluded
-        if first is None:
-            found[:, 0] = True
-        else:
-            found &= np.arange(slope.shape[1]) >= first[:, None]
-            found[np.arange(len(f)), first] = True
-        found[:, -1] = True
-        found[np.isnan(level)] = False
-        return np.nonzero(found)
+        reach, sized = np.maximum(d[:, :-1], d[:, 1:]), size(samples)
+        reach *= self._share[at[:, :-3]]
+        reach += np.maximum(sized[:, 1:-2], sized[:, 2:-1])
+        window, k = np.nonzero(~(reach <= level[rows, None]))
+        return window, at[window, k + 1]
 
 
 def blocks(f: Array) -> Iterator[slice]:
@@ -275,13 +323,6 @@ def row_blocks(f: Array) -> Iterator[slice]:
     """Yield rows (nrows, ntime) in blocks that fit into the cache."""
     count = max(1, _BLOCK // f.shape[1])
     return (slice(begin, begin + count) for begin in range(0, len(f), count))
-
-
-def joined(found: list[Places], f: Array) -> Places:
-    """Return rows and intervals of all signals from those of its blocks."""
-    begins = [some.start for some in row_blocks(f)]
-    rows = [NOWHERE, *(rows + begin for (rows, _), begin in zip(found, begins, strict=True))]
-    return np.concatenate(rows), np.concatenate([NOWHERE, *(chosen for _, chosen in found)])
 
 
 def maximum(t: Array, f: Array) -> float:
@@ -301,12 +342,11 @@ def peaks(t: Array, f: Array) -> Array:
 
 def _largest(t: Array, f: Array, size: Callable[[Array], Array], extrapolated: bool) -> Array:
     """Return the maximum of the signals or of their magnitudes."""
-    bulges, top, near = Bulges(t), np.empty(len(f)), list[Places]()
-    for some in row_blocks(f):
-        sized = size(f[some])
-        top[some] = largest = sized.max(axis=1)
-        near.append(bulges.beyond(f[some], sized, np.where(np.isfinite(largest), largest, np.nan)))
-    rows, chosen = joined(near, f)
+    bulges = Bulges(t)
+    low, high = bulges.extrema(f)
+    top = np.maximum(size(low), size(high)).max(axis=1)
+    level = np.where(np.isfinite(top), top, np.nan)
+    rows, chosen = bulges.beyond(f, size, level, np.maximum(-low, high))
     p = pieces(t, f, chosen, rows)
     inner = np.fmax.reduce(size(p(p.cuts)), axis=0)
     np.fmax.at(top, rows, inner if extrapolated else np.where(p.begins, -np.inf, inner))

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.metrics._pieces import Bulges, Places, joined, maxima, pieces, row_blocks
+from ctrlplan.metrics._pieces import Bulges, maxima, pieces
 from ctrlplan.metrics._records import HUGE, QUIET, Array, Value, finite, fitted, instant, plain, signal, times
 
 _ROUNDING = 4 * np.finfo(np.float64).eps  # of the levels: a response on the edge of the band is inside
@@ -238,16 +238,13 @@ def _last_entries(t: Array, e: Array, edges: Array) -> Array:
 
     -inf if always, inf if e is outside after the last sample but one.
     """
-    found, bulges, near = np.full(len(e), -np.inf), Bulges(t), list[Places]()
-    for some in row_blocks(e):
-        f, edge = e[some], edges[some]
-        size = np.abs(f)
-        outside = size > edge[:, None]
-        never = outside[:, -1] | ~(size.max(axis=1) < HUGE)
-        found[some][never] = np.inf
-        first = np.where(outside.any(axis=1), t.size - 1 - outside[:, ::-1].argmax(axis=1), 0)
-        near.append(bulges.beyond(f, size, np.where(never, np.nan, edge), np.minimum(first, t.size - 2)))
-    rows, chosen = joined(near, e)
+    bulges = Bulges(t)
+    low, high = bulges.extrema(e)
+    peaks = np.maximum(-low, high)
+    never = (np.abs(e[:, -1]) > edges) | ~(peaks.max(axis=1) < HUGE)
+    found = np.where(never, np.inf, -np.inf)
+    first = np.minimum(bulges.last_beyond(e, edges, peaks), t.size - 2)
+    rows, chosen = bulges.beyond(e, np.abs, np.where(never, np.nan, edges), peaks, first)
     p = pieces(t, e, chosen, rows)
     cuts, values = p.cuts, p.values
     beyond = np.abs(values) > edges[rows]

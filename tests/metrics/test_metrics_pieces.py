@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
 from ctrlplan import metrics
-from ctrlplan.metrics._pieces import Smooth, pieces, shared
+from ctrlplan.metrics._pieces import Smooth, maxima, pieces, shared
 
 UNEVEN = np.array([-1.0, -0.7, 0.1, 0.3, 0.9, 1.0, 1.8, 2.5])
 
@@ -223,3 +223,35 @@ def test_long_signals_whose_differences_overflow_are_straight_lines_there(metric
     turn = 2 * np.pi * t / t[-1]
     chord = (2 * np.pi / (count - 1)) ** 2 / 8
     assert metric(t, size * np.sin(turn)) / size == pytest.approx(metric(t, np.sin(turn)), rel=2 * chord)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_extrema_by_stretches_are_those_of_all_cubics(seed):
+    """Signals of many lengths, with jumps, noise and zeros: peaks, maxima and last entries from every cubic."""
+    rng = np.random.default_rng(seed)
+    for size in (2, 3, 4, 127, 128, 129, 131, 256, 385, 700):
+        t = np.linspace(0.0, 9.0, size) if seed % 2 else np.cumsum(rng.uniform(0.01, 1.0, size))
+        decay, pace, noise = rng.uniform(0.0, 1.0, (3, 4, 1))
+        f = np.exp(-decay * t) * np.cos(8.0 * pace * t) + (t > t[size // 2]) * (noise > 0.5)
+        f += 0.3 * (noise > 0.7) * rng.standard_normal(f.shape)
+        f[0] *= seed % 3
+        edge = float(np.abs(f).max() * rng.uniform(0.01, 1.05))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cubics = [pieces(t, row) for row in f]
+            values = [np.append(p(p.cuts).ravel(), row) for p, row in zip(cubics, f, strict=True)]
+        np.testing.assert_allclose(metrics.peak(t, f), [np.nanmax(np.abs(v)) for v in values], rtol=1e-12)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = maxima(t, f)
+        np.testing.assert_allclose(found, [np.nanmax(v) for v in values], rtol=1e-12, atol=1e-15)
+        # The distance from 0 of a signal with the target 0, which starts at 1.
+        entered = metrics.settling_time(t, f, 0.0, 1.0, band=edge, start=t[0])
+        for found, p, row in zip(entered, cubics, f, strict=True):
+            s = np.linspace(0.0, 1.0, 201)[:, None]
+            dense, times = np.abs(p(s)), p.time(s)
+            dense[0], dense[-1] = np.abs(p.a), np.abs(p.end)
+            outside = np.nonzero(dense > edge * (1.0 + 1e-12))
+            if abs(row[-1]) > edge or (outside[1] == size - 2).any():
+                assert found == np.inf
+            elif outside[0].size:
+                last = times[outside].max() - t[0]
+                assert 0.0 <= found - last <= np.diff(t).max() / 199.0
