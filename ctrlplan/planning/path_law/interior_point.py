@@ -9,7 +9,8 @@ from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from ctrlplan.planning.path_law.grid import Spline
 from ctrlplan.trajectories.common import Array
@@ -112,6 +113,7 @@ class _Search:
         own = self._scale[spline.index]
         self._points, self._weights = problem.points * own[:, None], problem.weights
         self._rows, self._upper, self._lower = problem.rows * own[:, None], problem.upper, problem.lower
+        self._both = np.concatenate([self._points, self._rows], axis=1)
         self._pairs = [(i, j) for i in range(len(own)) for j in range(i, len(own))]
         ends = np.sort(np.stack([self._index[[i, j]] for i, j in self._pairs]), axis=1)
         self._place = (ends[:, 1] - ends[:, 0]) * self._size + ends[:, 0]  # in the lower bands
@@ -209,17 +211,18 @@ class _Search:
     def _solver(self, curvature: Array, stiffness: Array) -> Callable[[Array], Array]:
         """Solution of the equations of a step."""
         of_rows, own = self._by_row(stiffness, 1.0)
-        points, rows = self._points * curvature, self._rows * of_rows
-        terms = np.stack([(points[i] * self._points[j]).sum(axis=0) for i, j in self._pairs])
-        terms += np.stack([(rows[i] * self._rows[j]).sum(axis=0) for i, j in self._pairs])
+        weighted = self._both * np.concatenate([curvature, of_rows])
+        terms = np.concatenate([np.add.reduce(own * self._both[i:], axis=1) for i, own in enumerate(weighted)])
         if self._fixed.any():
             fixed = self._fixed[self._index]
             terms[np.stack([fixed[i] | fixed[j] for i, j in self._pairs])] = 0.0
         bands = _summed(self._place, terms, (self._bandwidth + 1) * self._size).reshape(self._bandwidth + 1, self._size)
         bands[0] += np.where(self._fixed, 1.0, own)
-        factor = cholesky_banded(bands, lower=True, check_finite=False, overwrite_ab=True)
+        factor, failed = dpbtrf(bands, lower=1)
+        if failed:
+            raise LinAlgError(f"minor {failed} must be positive")
         free = ~self._fixed
-        return lambda right: free * cho_solve_banded((factor, True), free * right, check_finite=False)
+        return lambda right: free * dpbtrs(factor, free * right, lower=1)[0]
 
 
 def _applied(rows: Array, x: Array) -> Array:
@@ -237,6 +240,5 @@ def _summed(index: NDArray[np.intp], values: Array, size: int) -> Array:
 
 def _longest(values: Array, changes: Array, cap: float = 1.0) -> float:
     """Longest step, up to `cap`, for which values of at least 0 remain so."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = float(np.fmax.reduce(-changes / values))
+    ratio = float(np.fmax.reduce(-changes / values))
     return min(cap, 1.0 / ratio) if ratio > 0.0 else cap
