@@ -38,6 +38,9 @@ _POINTS: Array = np.asarray(0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 10)), dty
 _ROUNDS, _GAIN = 30, 5e-4
 """Maximum number of problems, and the decrease of the duration, relative to it, that ends them."""
 
+_FIRST_ROUNDS = 10
+"""Maximum number of problems on the first cells, whose local minimum is only the start on finer ones."""
+
 _LOSS, _REFINEMENTS, _PIECES = 5e-3, 3, 3
 """As for limits of the acceleration; signals are at no limit while a derivative of the rate changes."""
 
@@ -192,12 +195,14 @@ class _Problems:
 
     def _refined(self, x: Array, reserve: float) -> Iterator[tuple[_Problems, Array]]:
         """Local minima on finer and finer cells, with their problems."""
-        problems, found, former = self, self._converged(x, self._reserves(reserve)), math.inf
+        problems, found, former = self, self._converged(x, self._reserves(reserve), _FIRST_ROUNDS), math.inf
         yield self, found.x
         for _ in range(_REFINEMENTS):
             local = problems._spline.coefficients(found.x)
             loss = problems._signals.losses(local)
             if loss.sum() < _LOSS or found.duration > (1.0 - _FINER) * former:
+                if problems is self:  # the first cells are the last ones
+                    yield self, self._converged(found.x, self._reserves(reserve)).x
                 return
             counts = np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int)
             counts[problems._grid.rests.any(axis=0)] = 1  # there derivatives of the law multiply rounding of the plan
@@ -246,13 +251,13 @@ class _Problems:
             return np.full(self._grid.length.size, _INFEASIBLE)
         return self._between.excess(retimed.jet(times, self._limited.order))
 
-    def _converged(self, x: Array, reserves: Array) -> _Solution:
+    def _converged(self, x: Array, reserves: Array, rounds: int = _ROUNDS) -> _Solution:
         """Local minimum near coefficients, with a distance (ncells,) from the limits in each cell.
 
         Solutions are compared by their durations with a penalty of violations of the limits.
         """
         best, duration, trust, solved = x, math.inf, _TRUST, False
-        for _ in range(_ROUNDS):
+        for _ in range(rounds):
             try:
                 rows = self._signals.rows(self._spline.coefficients(x), reserves)
                 problem = replace(problem_of(self._grid, self._spline, rows), trust=trust)
