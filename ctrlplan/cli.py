@@ -147,7 +147,11 @@ def _new(options: argparse.Namespace) -> list[Path]:
 def _reproduce(options: argparse.Namespace) -> list[Path]:
     _checked_folder(options.out)
     from ctrlplan.studies import PAPER
+    from ctrlplan.symbolic import missing_casadi
 
+    reason = missing_casadi()
+    if reason:
+        _print_status(f"the crane is simulated by Python, which takes ten times as long: {reason}")
     return _all_of(PAPER, options.out, "Path planning with trigonometric splines: studies of the paper")
 
 

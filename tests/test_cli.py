@@ -476,3 +476,13 @@ def test_the_command_is_installed_under_its_name():
     (entry,) = entry_points(group="console_scripts", name="ctrlplan")
     assert entry.value == "ctrlplan.cli:main"
     assert entry.load() is main
+
+
+def test_reproduce_says_what_takes_long_without_casadi(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("ctrlplan.studies.PAPER", {})
+    monkeypatch.setattr("ctrlplan.reports.write_report", lambda *given: [])
+    assert main(["reproduce", "--out", str(tmp_path)]) == 0
+    assert "pip install" not in capsys.readouterr().err
+    monkeypatch.setattr("ctrlplan.symbolic.extra.find_spec", lambda name: None)
+    assert main(["reproduce", "--out", str(tmp_path)]) == 0
+    assert "takes ten times as long: CasADi is not installed (pip install ctrlplan[fast])" in capsys.readouterr().err
