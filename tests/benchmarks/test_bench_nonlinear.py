@@ -201,8 +201,8 @@ def test_draws_with_metrics(benchmark, capsys, crane):
 
     benchmark.pedantic(ours, rounds=1, warmup_rounds=1)
     first, slowly = 32, 2
-    whole, (found, expected) = interleaved(ours, lambda: [peer(mass) for mass in masses], 2)
-    building, (_, slow) = interleaved(lambda: ours(first), lambda: [by_lsoda(mass) for mass in masses[:slowly]], 2)
+    whole, (found, expected) = interleaved(ours, lambda: [peer(mass) for mass in masses], 4)
+    building, (_, slow) = interleaved(lambda: ours(first), lambda: [by_lsoda(mass) for mass in masses[:slowly]], 4)
     assert max(worst(a, b) for a, b in zip(expected[:slowly], slow, strict=True)) <= 1e-7
     loads = [s[4] + s[5] * np.sin(s[6]) + DRUM * np.cos(s[6]) for s in expected]
     ahead = np.max(loads - PLAN(T)[0], axis=1)
