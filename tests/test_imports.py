@@ -3,6 +3,7 @@
 import ast
 import tomllib
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -145,8 +146,24 @@ def test_every_exception_of_the_import_contract_is_one_that_is_named():
         else:
             assert entry in (
                 "ctrlplan.planning.quantities -> ctrlplan.flatness.quantities",  # the adapter
-                "ctrlplan.planning.quantities -> ctrlplan.simulation.loop_quantities",  # the adapter, for loops
+                "ctrlplan.planning.quantities -> ctrlplan.simulation.quantities_of_loops",  # the adapter, for loops
                 "ctrlplan.trajectories.chosen -> ctrlplan.planning.alpha",  # TrigSpline(alpha="auto")
                 "ctrlplan.trajectories.chosen -> ctrlplan.planning.cycle",  # on_cycle(dt, limits)
                 "ctrlplan.trajectories.chosen -> ctrlplan.planning.stop",  # stop(time, limits)
             )
+
+
+@pytest.mark.parametrize("package", ["simulation", "trajectories"])
+def test_names_that_a_package_loads_later_are_those_that_type_checkers_see(package):
+    """Their modules are the same, and no module has the name of one of them, which it would replace once loaded."""
+    tree = TREES[f"{package}/__init__.py"]
+    (guarded,) = (node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+    seen = {alias.name: node.module for node in guarded.body for alias in node.names}
+    loaded = import_module(f"ctrlplan.{package}")
+    assert {name: f"ctrlplan.{package}.{module}" for name, module in loaded._HOME.items()} == seen
+    assert seen.keys() <= set(loaded.__all__)
+    assert not seen.keys() & {path.stem for path in (ROOT / package).iterdir()}
+    for name in loaded.__all__:
+        assert getattr(loaded, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = loaded.nothing

@@ -200,7 +200,7 @@ def test_all_is_exactly_what_is_visible(name):
     exported = module.__all__
     assert len(exported) == len(set(exported))
     files = {m.name for m in pkgutil.iter_modules(module.__path__)}
-    visible = {n for n in vars(module) if not n.startswith("_")} - files
+    visible = {n for n in dir(module) if not n.startswith("_")} - files
     assert visible == set(exported) - files
     for export in exported:
         assert getattr(module, export).__doc__

@@ -220,7 +220,7 @@ def loop_of(system: Any, tail: float | None = None) -> Loop | None:
     flat = callable(getattr(system, "quantities", None)) or (hasattr(system, "forward") and hasattr(system, "reverse"))
     if flat or not hasattr(system, "ninputs"):
         return None
-    from ctrlplan.simulation.loop_quantities import loop_quantities
+    from ctrlplan.simulation.quantities_of_loops import loop_quantities
 
     return loop_quantities(system, tail=tail)
 

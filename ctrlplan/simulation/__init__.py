@@ -63,20 +63,25 @@ Crane with limited force; an event ends the run if the rope becomes slack:
 (12.0, [])
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from ctrlplan.simulation.equilibrium import equilibrium_at, equilibrium_state, unstable_poles
 from ctrlplan.simulation.events import Event, Occurrence, what_happened
 from ctrlplan.simulation.interpreted import SolverError
-from ctrlplan.simulation.log import measured_response, read_log
-from ctrlplan.simulation.loop_quantities import LoopQuantities, loop_quantities
-from ctrlplan.simulation.loop_response import Extremes, LoopResponse
-from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start, unchanged
 from ctrlplan.simulation.response import SimulationResponse, signal_table
-from ctrlplan.simulation.sampled_response import SampledQuantities
 from ctrlplan.simulation.simulate import simulate
-from ctrlplan.simulation.simulated_response import SimulatedQuantities
 from ctrlplan.simulation.starts import check_begin
-from ctrlplan.simulation.stepper import Stepper
+
+if TYPE_CHECKING:
+    from ctrlplan.simulation.log import measured_response, read_log
+    from ctrlplan.simulation.loop_response import Extremes, LoopResponse
+    from ctrlplan.simulation.predictor import Predictor
+    from ctrlplan.simulation.quantities_of_loops import LoopQuantities, loop_quantities
+    from ctrlplan.simulation.sampled_response import SampledQuantities
+    from ctrlplan.simulation.simulated_response import SimulatedQuantities
+    from ctrlplan.simulation.stepper import Stepper
 
 __all__ = [
     "Event",
@@ -107,3 +112,27 @@ __all__ = [
     "unstable_poles",
     "what_happened",
 ]
+
+_HOME = {
+    "Extremes": "loop_response",
+    "LoopQuantities": "quantities_of_loops",
+    "LoopResponse": "loop_response",
+    "Predictor": "predictor",
+    "SampledQuantities": "sampled_response",
+    "SimulatedQuantities": "simulated_response",
+    "Stepper": "stepper",
+    "loop_quantities": "quantities_of_loops",
+    "measured_response": "log",
+    "read_log": "log",
+}
+"""Modules of names that a run does not require; they are loaded when a name is first read."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__]

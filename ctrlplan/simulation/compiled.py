@@ -268,7 +268,7 @@ class Compiled:
         """Output times of a segment from `left` in units of it, found once for many of them."""
         if grid.size == 1:
             return _END
-        if grid.size <= _AT_ONCE:
+        if grid.size <= _APART:
             return Pattern.of(left, grid)
         key = left, grid.size, *grid[[0, grid.size // 2, -1]].tolist()
         times, found = self._patterns.get(key, lambda: (grid.copy(), Pattern.of(left, grid)))
@@ -544,10 +544,7 @@ class CompiledSolver:
             each = [self._advanced(series, left, grid[k : k + 1], state, _END) for k in range(grid.size)]
             return np.concatenate(each, axis=1)
         if series is not self._series:
-            undefined = np.where(np.isfinite(_terms(series)).all(axis=1), 0.0, np.nan)
-            bounds = series.low + undefined, series.high + undefined
-            parts = [self._p, _terms(series).ravel(order="F"), *bounds, self._shift, self._scale]
-            self._known, self._series = np.concatenate(parts), series
+            self._known, self._series = np.concatenate([self._p, series.flat, self._shift, self._scale]), series
         last = series.right if series.harmonics is None else series.harmonics.rate
         span = (left, right - left, series.left, last, *within(left, right, self.switches))
         start = (state[moving] - self._shift) / self._scale
@@ -574,8 +571,7 @@ class CompiledSolver:
         # Equations that depend on time are evaluated at least once per sample, so that no pulse is skipped.
         longest = pattern.longest if self.form.depends_on_time else 0.0
         allowed = min(_FEW_STEPS, self._max_steps)
-        width = _terms(series).shape[1]
-        what = width, series.harmonics is not None, self._scaled
+        what = series.terms.shape[1], series.harmonics is not None, self._scaled
         return Settings(*what, pattern.grid, self._kind, *self._tolerances, allowed, longest)
 
     def _is_rare(self, settings: Settings, count: int) -> bool:
@@ -777,11 +773,6 @@ def _linear(a: ArrayLike, b: ArrayLike, x: ca.SX, u: ca.SX) -> ca.SX:
 def _sparse(matrix: ArrayLike) -> ca.DM:
     """Sparse matrix: 0 times nan is then 0, and the equations are shorter."""
     return ca.sparsify(ca.DM(np.asarray(matrix, dtype=float)))
-
-
-def _terms(series: Series) -> Array:
-    """Coefficients (nsignals, width) of the functions of time of a segment: of harmonics if they are known."""
-    return series.coefficients if series.harmonics is None else series.harmonics.coefficients
 
 
 def _chebyshev(numerator: ca.SX, length: ca.SX, width: int) -> ca.SX:

@@ -11,7 +11,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -121,6 +121,17 @@ class Series:
         u = np.clip((2.0 * times - self.left - self.right) / (self.right - self.left), -1.0, 1.0)
         values = self.coefficients @ np.cos(_counts(self.coefficients.shape[1])[:, None] * np.arccos(u))
         return np.asarray(np.clip(values, self.low[:, None], self.high[:, None]))
+
+    @property
+    def terms(self) -> Array:
+        """Coefficients (nsignals, width) for a compiled form: of the harmonics if they are known."""
+        return self.coefficients if self.harmonics is None else self.harmonics.coefficients
+
+    @cached_property
+    def flat(self) -> Array:
+        """These, column by column, and the bounds; nan for a signal whose coefficients are not finite."""
+        undefined = np.where(np.isfinite(self.terms).all(axis=1), 0.0, np.nan)
+        return np.concatenate([self.terms.ravel(order="F"), self.low + undefined, self.high + undefined])
 
     def with_harmonics(self, known: tuple[float, int] | None, accuracy: float, rounding: Array | float) -> Series:
         """Same signals with their trigonometric sum of known rate and number of harmonics, if it has fewer terms."""

@@ -245,7 +245,7 @@ def _response(job: Job, record: Record) -> SimulationResponse:
     prepared = job.prepared
     found = _occurrences(record)
     times, states = record.times, record.states
-    if times is not job.times:
+    if times is not job.times and not np.array_equal(times, job.times):
         places = np.searchsorted(times, job.times[job.times <= times[-1]])
         times, states = times[places], states[:, places]
     last = next((occurrence.time for occurrence in found if occurrence.stop), None)

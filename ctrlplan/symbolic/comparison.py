@@ -36,7 +36,8 @@ class Compared:
 
     def is_due(self, sides: Array) -> bool:
         """Whether to compare a run on these sides (nswitches, ntime) of its switches."""
-        reached = np.array([(sides == side).any(axis=1) for side in (-1.0, 0.0, 1.0)])
+        lowest, highest = (extreme.reduce(sides, axis=1, initial=np.nan) for extreme in (np.fmin, np.fmax))
+        reached = np.array([lowest < 0.0, (sides == 0.0).any(axis=1), highest > 0.0])
         with BUILDING:
             self._runs += 1
             fresh = bool((reached & ~self._seen).any())
