@@ -142,8 +142,6 @@ class NewtonSystem(Fields):
     _spread: Array | None
     _fold: float
     _nodes: Array
-    _first: Array
-    _second: Array
     _moments: list[float]  # nodes, each waypoint once
     _pairs: _Pairs
 
@@ -188,8 +186,6 @@ class NewtonSystem(Fields):
             _is_short=pattern.is_short,
             _fold=fold,
             _nodes=readonly(nodes),
-            _first=nodes[0 : size - size % 2 : 2],
-            _second=nodes[1::2],
             _moments=moments,
             _pairs=pairs,
         )
@@ -202,7 +198,7 @@ class NewtonSystem(Fields):
             roughness = self.squared_samples(smooth) if size > count else None
             collocation, spread = _factor(collocation, pattern.hermite, roughness, pattern.lead)
         self._set_fields(_triangle=readonly(np.asfortranarray(collocation)), _spread=spread)
-        if not self._triangle.diagonal().all():
+        if np.count_nonzero(self._triangle.diagonal()) < count:
             raise ValueError("the constraints must determine the plan, got a singular system")
 
     def taylor_scale(self, duration: float) -> Array:
@@ -301,7 +297,13 @@ class NewtonSystem(Fields):
         -------
         ndarray, shape (size, order + 1, ntime)
         """
-        return self._taylor(u - self._first[:, None], u - self._second[:, None], order)
+        first, second = self._paired
+        return self._taylor(u - first[:, None], u - second[:, None], order)
+
+    @cached_property
+    def _paired(self) -> tuple[Array, Array]:
+        """Nodes of the first and of the second factor of each pair."""
+        return self._nodes[: self.size - self.size % 2 : 2], self._nodes[1::2]
 
     def _taylor(self, first: Array, second: Array, order: int) -> Array:
         """Taylor coefficients from the distances (npairs, ntime) to the nodes of each pair."""
@@ -395,7 +397,7 @@ class NewtonSystem(Fields):
         -------
         ndarray, shape (order + 1, size, ntime)
         """
-        half, count = 0.5 * effective(self.alpha), 2 * len(self._second)
+        half, count = 0.5 * effective(self.alpha), 2 * (self.size // 2)
         if order > _ELEMENTARY:
             return self.taylor(u, order).transpose(1, 0, 2)
         apart = u - self._nodes[:count, None]
@@ -445,7 +447,7 @@ class NewtonSystem(Fields):
         """Taylor series of each axis at one normalised time, a number or a symbol."""
         factors = [
             pair_series(self.alpha, u - first, u - second, order)
-            for first, second in zip(self._first.tolist(), self._second.tolist(), strict=True)
+            for first, second in zip(*map(np.ndarray.tolist, self._paired), strict=True)
         ]
         columns = coefficients.T.tolist()
         if self._fold:
@@ -483,7 +485,7 @@ class NewtonSystem(Fields):
         Skeel's componentwise bound to first order: the rounding of each product of
         the triangular solution is propagated to the plan by the inverse.
         """
-        if self.amplification < _SUSPECT:
+        if self._is_mild:
             return 0.0
         data = taylor_data - self._positions * taylor_data[self._anchor]
         solved = blas.dtrsm(1.0, self._triangle, data, lower=1)
@@ -497,7 +499,7 @@ class NewtonSystem(Fields):
     @cached_property
     def functions(self) -> Array:
         """Values (size, ntime) of the basis functions on a grid that resolves any plan."""
-        u, half, count = _grid(2 * self.size + 1), 0.5 * effective(self.alpha), 2 * len(self._second)
+        u, half, count = _grid(2 * self.size + 1), 0.5 * effective(self.alpha), 2 * (self.size // 2)
         apart = u - self._nodes[:count, None]
         out = np.empty((count + 1, u.size))
         out[0] = 1.0
@@ -555,9 +557,25 @@ class NewtonSystem(Fields):
     @cached_property
     def amplification(self) -> float:
         """Maximum amplification of rounding errors by the solution."""
-        scaled = self._triangle / np.abs(self._triangle).max(axis=0)
-        inverse: Array = blas.dtrsm(1.0, scaled, _identity(len(scaled)), lower=1)
+        scaled, inverse = self._scaled
         return float((np.abs(inverse) @ np.abs(scaled)).max())
+
+    @cached_property
+    def _is_mild(self) -> bool:
+        """Whether the amplification is below `_SUSPECT`.
+
+        As no entry of the scaled triangle is above 1, no row of the product of absolute
+        values is above the sum of a row of the inverse, which the root of its squares
+        bounds. Nothing more is needed for nearly all systems.
+        """
+        _, inverse = self._scaled
+        return len(inverse) * float(np.vdot(inverse, inverse)) < _SUSPECT**2 or self.amplification < _SUSPECT
+
+    @property
+    def _scaled(self) -> tuple[Array, Array]:
+        """The triangle with columns of largest entry 1, and its inverse."""
+        scaled = self._triangle / np.abs(self._triangle).max(axis=0)
+        return scaled, blas.dtrsm(1.0, scaled, _identity(len(scaled)), lower=1)
 
     @cached_property
     def _samples(self) -> tuple[Array, Array]:
@@ -852,9 +870,10 @@ def _leja(
     while len(chosen) < len(u) - 1:
         # Rescaled, so that the products do not underflow for many waypoints.
         farthest = len(u) - 1 if meet and len(chosen) == 1 else product.index(max(product))
-        scale = product[farthest] or 1.0
-        product = [p * (d / scale) for p, d in zip(product, distances(u[farthest]), strict=True)]
         chosen.append(farthest)
+        if len(chosen) < len(u) - 1:
+            scale = product[farthest] or 1.0
+            product = [p * (d / scale) for p, d in zip(product, distances(u[farthest]), strict=True)]
     chosen += set(range(len(u))) - set(chosen)
     return tuple([used[i] for i in chosen]), meet
 
