@@ -574,7 +574,7 @@ class NewtonSystem(Fields):
     @property
     def _scaled(self) -> tuple[Array, Array]:
         """The triangle with columns of largest entry 1, and its inverse."""
-        scaled = self._triangle / np.abs(self._triangle).max(axis=0)
+        scaled = self._triangle / np.maximum.reduce(np.abs(self._triangle), axis=0)
         return scaled, blas.dtrsm(1.0, scaled, _identity(len(scaled)), lower=1)
 
     @cached_property
@@ -592,7 +592,7 @@ class NewtonSystem(Fields):
         return (FACTORIALS[order] * np.sqrt(weights) * self.taylor(nodes, order)[:, order]).T
 
 
-def _products_at_nodes(beyond: Array, apart: NDArray[np.bool_], places: NDArray[np.intp], order: int) -> Array:
+def _products_at_nodes(beyond: Array, apart: Array, places: NDArray[np.intp], order: int) -> Array:
     """Collocation of polynomials: each product without its factors that are 0, by elementary symmetric sums.
 
     With the ratios 1/(x - x_i) of its other factors, the coefficient k of such a
@@ -608,7 +608,7 @@ def _products_at_nodes(beyond: Array, apart: NDArray[np.bool_], places: NDArray[
     order : int
         Highest coefficient.
     """
-    factors = np.where(apart, beyond, 1.0)
+    factors = beyond + (1.0 - apart)  # those at their own waypoints are 0
     ratio = apart / factors
     sums = np.zeros((max(order, 1) + 1, len(beyond), beyond.shape[1] + 1))
     value = sums[0]
@@ -789,8 +789,8 @@ class _Pattern(NamedTuple):
         Number of waypoints if they are few and begin with their positions, else 0.
     pairs : _Pairs
         Pairs of waypoints, as nodes.
-    apart : ndarray of bool, shape (nwaypoints, nconstraints)
-        Whether a node is not at a waypoint.
+    apart : ndarray, shape (nwaypoints, nconstraints)
+        1 for a node that is not at a waypoint, else 0.
     places : ndarray of int, shape (nconstraints, nconstraints), or None
         Place in the sums of `_products_at_nodes` of each function, by constraint; None for many constraints or
         high orders.
@@ -806,7 +806,7 @@ class _Pattern(NamedTuple):
     lead: int
     is_short: int
     pairs: _Pairs
-    apart: NDArray[np.bool_]
+    apart: Array
     places: NDArray[np.intp] | None
 
 
@@ -818,7 +818,8 @@ def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet:
     orders = np.array(keys, dtype=np.intp)
     waypoints, positions = np.array(at, dtype=np.intp), (orders == 0).astype(float)[:, None]
     apart = np.arange(len(given))[:, None] != waypoints
-    for array in (orders, waypoints, positions, apart):
+    distinct = apart.astype(float)
+    for array in (orders, waypoints, positions, distinct):
         array.flags.writeable = False
     hermite = all([own == tuple(range(len(own))) for own in given])
     number = len(set(at))
@@ -826,7 +827,9 @@ def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet:
     anchor = int((orders == 0).argmax())
     places = _places(apart, orders, waypoints) if len(at) <= _STORED and max(keys) <= _ELEMENTARY else None
     lead = len(first)
-    return _Pattern(at, keys, waypoints, orders, positions, anchor, hermite, lead, is_short, _pairs(at), apart, places)
+    return _Pattern(
+        at, keys, waypoints, orders, positions, anchor, hermite, lead, is_short, _pairs(at), distinct, places
+    )
 
 
 def _places(apart: NDArray[np.bool_], orders: NDArray[np.intp], waypoints: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -291,6 +291,13 @@ class Entries:
         times = readonly(np.fromiter([point.time for point in waypoints], float, len(jets)))
         return cls(times, readonly(table), counts, waypoints[0].labels)
 
+    @classmethod
+    def of_rows(cls, times: Array, rows: Array) -> Entries:
+        """Entries from those by axis, (naxes, order + 1, nwaypoints), which are made read-only."""
+        found = cls(times, readonly(rows).T, np.full(times.size, rows.shape[1]), None)
+        found.__dict__["rows"] = rows  # known before it is asked for
+        return found
+
     @cached_property
     def rows(self) -> Array:
         """The entries by axis, (naxes, order + 1, nwaypoints), as used in computations."""
