@@ -295,7 +295,7 @@ class Entries:
     def of_rows(cls, times: Array, rows: Array) -> Entries:
         """Entries from those by axis, (naxes, order + 1, nwaypoints), which are made read-only."""
         found = cls(times, readonly(rows).T, np.full(times.size, rows.shape[1]), None)
-        found.__dict__["rows"] = rows  # known before it is asked for
+        found.__dict__["rows"] = rows  # the cached property needs no copy
         return found
 
     @cached_property
