@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from numbers import Real
 from typing import Any
 
@@ -71,6 +72,7 @@ def real_array(values: ArrayLike, name: str) -> Array:
     return array.astype(float, copy=False)
 
 
+@lru_cache(maxsize=128)
 def default_labels(naxes: int) -> tuple[str, ...]:
     """Names y, or y1, y2, ... for more than one axis."""
     return ("y",) if naxes == 1 else tuple(f"y{i + 1}" for i in range(naxes))
@@ -266,7 +268,8 @@ def _check_kinds(values: Any, name: str) -> None:
         return
     if isinstance(values, list | tuple):
         for value in values:
-            _check_kinds(value, name)
+            if type(value) is not float:
+                _check_kinds(value, name)
         return
     kind = getattr(getattr(values, "dtype", None), "kind", None)
     if isinstance(values, bool | str | bytes | complex) or (kind is not None and kind in "bcSU"):

@@ -142,8 +142,6 @@ class NewtonSystem(Fields):
     _spread: Array | None
     _fold: float
     _nodes: Array
-    _first: Array
-    _second: Array
     _moments: list[float]  # nodes, each waypoint once
     _pairs: _Pairs
 
@@ -188,8 +186,6 @@ class NewtonSystem(Fields):
             _is_short=pattern.is_short,
             _fold=fold,
             _nodes=readonly(nodes),
-            _first=nodes[0 : size - size % 2 : 2],
-            _second=nodes[1::2],
             _moments=moments,
             _pairs=pairs,
         )
@@ -202,7 +198,7 @@ class NewtonSystem(Fields):
             roughness = self.squared_samples(smooth) if size > count else None
             collocation, spread = _factor(collocation, pattern.hermite, roughness, pattern.lead)
         self._set_fields(_triangle=readonly(np.asfortranarray(collocation)), _spread=spread)
-        if not self._triangle.diagonal().all():
+        if np.count_nonzero(self._triangle.diagonal()) < count:
             raise ValueError("the constraints must determine the plan, got a singular system")
 
     def taylor_scale(self, duration: float) -> Array:
@@ -301,7 +297,13 @@ class NewtonSystem(Fields):
         -------
         ndarray, shape (size, order + 1, ntime)
         """
-        return self._taylor(u - self._first[:, None], u - self._second[:, None], order)
+        first, second = self._paired
+        return self._taylor(u - first[:, None], u - second[:, None], order)
+
+    @cached_property
+    def _paired(self) -> tuple[Array, Array]:
+        """Nodes of the first and of the second factor of each pair."""
+        return self._nodes[: self.size - self.size % 2 : 2], self._nodes[1::2]
 
     def _taylor(self, first: Array, second: Array, order: int) -> Array:
         """Taylor coefficients from the distances (npairs, ntime) to the nodes of each pair."""
@@ -395,7 +397,7 @@ class NewtonSystem(Fields):
         -------
         ndarray, shape (order + 1, size, ntime)
         """
-        half, count = 0.5 * effective(self.alpha), 2 * len(self._second)
+        half, count = 0.5 * effective(self.alpha), 2 * (self.size // 2)
         if order > _ELEMENTARY:
             return self.taylor(u, order).transpose(1, 0, 2)
         apart = u - self._nodes[:count, None]
@@ -445,7 +447,7 @@ class NewtonSystem(Fields):
         """Taylor series of each axis at one normalised time, a number or a symbol."""
         factors = [
             pair_series(self.alpha, u - first, u - second, order)
-            for first, second in zip(self._first.tolist(), self._second.tolist(), strict=True)
+            for first, second in zip(*map(np.ndarray.tolist, self._paired), strict=True)
         ]
         columns = coefficients.T.tolist()
         if self._fold:
@@ -483,7 +485,7 @@ class NewtonSystem(Fields):
         Skeel's componentwise bound to first order: the rounding of each product of
         the triangular solution is propagated to the plan by the inverse.
         """
-        if self.amplification < _SUSPECT:
+        if self._is_mild:
             return 0.0
         data = taylor_data - self._positions * taylor_data[self._anchor]
         solved = blas.dtrsm(1.0, self._triangle, data, lower=1)
@@ -497,7 +499,7 @@ class NewtonSystem(Fields):
     @cached_property
     def functions(self) -> Array:
         """Values (size, ntime) of the basis functions on a grid that resolves any plan."""
-        u, half, count = _grid(2 * self.size + 1), 0.5 * effective(self.alpha), 2 * len(self._second)
+        u, half, count = _grid(2 * self.size + 1), 0.5 * effective(self.alpha), 2 * (self.size // 2)
         apart = u - self._nodes[:count, None]
         out = np.empty((count + 1, u.size))
         out[0] = 1.0
@@ -555,9 +557,25 @@ class NewtonSystem(Fields):
     @cached_property
     def amplification(self) -> float:
         """Maximum amplification of rounding errors by the solution."""
-        scaled = self._triangle / np.abs(self._triangle).max(axis=0)
-        inverse: Array = blas.dtrsm(1.0, scaled, _identity(len(scaled)), lower=1)
+        scaled, inverse = self._scaled
         return float((np.abs(inverse) @ np.abs(scaled)).max())
+
+    @cached_property
+    def _is_mild(self) -> bool:
+        """Whether the amplification is below `_SUSPECT`.
+
+        As no entry of the scaled triangle is above 1, no row of the product of absolute
+        values is above the sum of a row of the inverse, which the root of its squares
+        bounds. Nothing more is needed for nearly all systems.
+        """
+        _, inverse = self._scaled
+        return len(inverse) * float(np.vdot(inverse, inverse)) < _SUSPECT**2 or self.amplification < _SUSPECT
+
+    @property
+    def _scaled(self) -> tuple[Array, Array]:
+        """The triangle with columns of largest entry 1, and its inverse."""
+        scaled = self._triangle / np.maximum.reduce(np.abs(self._triangle), axis=0)
+        return scaled, blas.dtrsm(1.0, scaled, _identity(len(scaled)), lower=1)
 
     @cached_property
     def _samples(self) -> tuple[Array, Array]:
@@ -574,7 +592,7 @@ class NewtonSystem(Fields):
         return (FACTORIALS[order] * np.sqrt(weights) * self.taylor(nodes, order)[:, order]).T
 
 
-def _products_at_nodes(beyond: Array, apart: NDArray[np.bool_], places: NDArray[np.intp], order: int) -> Array:
+def _products_at_nodes(beyond: Array, apart: Array, places: NDArray[np.intp], order: int) -> Array:
     """Collocation of polynomials: each product without its factors that are 0, by elementary symmetric sums.
 
     With the ratios 1/(x - x_i) of its other factors, the coefficient k of such a
@@ -590,7 +608,7 @@ def _products_at_nodes(beyond: Array, apart: NDArray[np.bool_], places: NDArray[
     order : int
         Highest coefficient.
     """
-    factors = np.where(apart, beyond, 1.0)
+    factors = beyond + (1.0 - apart)  # those at their own waypoints are 0
     ratio = apart / factors
     sums = np.zeros((max(order, 1) + 1, len(beyond), beyond.shape[1] + 1))
     value = sums[0]
@@ -771,8 +789,8 @@ class _Pattern(NamedTuple):
         Number of waypoints if they are few and begin with their positions, else 0.
     pairs : _Pairs
         Pairs of waypoints, as nodes.
-    apart : ndarray of bool, shape (nwaypoints, nconstraints)
-        Whether a node is not at a waypoint.
+    apart : ndarray, shape (nwaypoints, nconstraints)
+        1 for a node that is not at a waypoint, else 0.
     places : ndarray of int, shape (nconstraints, nconstraints), or None
         Place in the sums of `_products_at_nodes` of each function, by constraint; None for many constraints or
         high orders.
@@ -788,7 +806,7 @@ class _Pattern(NamedTuple):
     lead: int
     is_short: int
     pairs: _Pairs
-    apart: NDArray[np.bool_]
+    apart: Array
     places: NDArray[np.intp] | None
 
 
@@ -800,7 +818,8 @@ def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet:
     orders = np.array(keys, dtype=np.intp)
     waypoints, positions = np.array(at, dtype=np.intp), (orders == 0).astype(float)[:, None]
     apart = np.arange(len(given))[:, None] != waypoints
-    for array in (orders, waypoints, positions, apart):
+    distinct = apart.astype(float)
+    for array in (orders, waypoints, positions, distinct):
         array.flags.writeable = False
     hermite = all([own == tuple(range(len(own))) for own in given])
     number = len(set(at))
@@ -808,7 +827,9 @@ def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet:
     anchor = int((orders == 0).argmax())
     places = _places(apart, orders, waypoints) if len(at) <= _STORED and max(keys) <= _ELEMENTARY else None
     lead = len(first)
-    return _Pattern(at, keys, waypoints, orders, positions, anchor, hermite, lead, is_short, _pairs(at), apart, places)
+    return _Pattern(
+        at, keys, waypoints, orders, positions, anchor, hermite, lead, is_short, _pairs(at), distinct, places
+    )
 
 
 def _places(apart: NDArray[np.bool_], orders: NDArray[np.intp], waypoints: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -852,9 +873,10 @@ def _leja(
     while len(chosen) < len(u) - 1:
         # Rescaled, so that the products do not underflow for many waypoints.
         farthest = len(u) - 1 if meet and len(chosen) == 1 else product.index(max(product))
-        scale = product[farthest] or 1.0
-        product = [p * (d / scale) for p, d in zip(product, distances(u[farthest]), strict=True)]
         chosen.append(farthest)
+        if len(chosen) < len(u) - 1:
+            scale = product[farthest] or 1.0
+            product = [p * (d / scale) for p, d in zip(product, distances(u[farthest]), strict=True)]
     chosen += set(range(len(u))) - set(chosen)
     return tuple([used[i] for i in chosen]), meet
 

@@ -646,8 +646,8 @@ def _entries_of(times: Array, values: ArrayLike, derivatives: Mapping[int, Array
                 f"got {row.shape}"
             )
         rows[:, order] = row
-    if np.isinf(rows).any():
+    if not are_finite(rows) and np.isinf(rows).any():
         i, order, axis = np.argwhere(np.isinf(rows.T))[0].tolist()
         name = f"derivatives[{order}]" if order else "values"
         raise ValueError(f"{name} must be finite or nan (free), got {rows[axis, order, i]} at times[{i}], axis {axis}")
-    return Entries(times, readonly(rows).T, np.full(times.size, 1 + highest), None)
+    return Entries.of_rows(times, rows)

@@ -144,9 +144,15 @@ class Waypoint(Displayed, Fields):
     def _of_checked(cls, time: float, jet: Array, labels: tuple[str, ...] | None, complete: bool) -> Waypoint:
         """Waypoint from a read-only array without infinite values; as `from_array`, without checks."""
         self = cls.__new__(cls)
-        values = {"time": time, "jet": jet, "labels": labels, "complete": complete, "naxes": jet.shape[1]}
-        self.__dict__.update(values)
+        self._keep(time, jet, labels, complete)
         return self
+
+    def _keep(self, time: float, jet: Array, labels: tuple[str, ...] | None, complete: bool) -> None:
+        """Set the fields of a new waypoint without the checks of `_set_fields`; plans read many waypoints."""
+        values = {"time": time, "jet": jet, "labels": labels, "complete": complete, "naxes": jet.shape[1]}
+        if self.__dict__:
+            self._set_fields(**values)  # raises: it is not new
+        self.__dict__.update(values)
 
     def _set(self, time: float, jet: Array, labels: tuple[str, ...] | None) -> None:
         complete = are_finite(jet) or bool(np.isfinite(jet).all())
@@ -154,7 +160,7 @@ class Waypoint(Displayed, Fields):
             order, axis = np.argwhere(np.isinf(jet))[0]
             name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
             raise ValueError(f"{name} must be finite or nan (free), got {jet[order, axis]} at time {time:g}")
-        self._set_fields(time=time, jet=readonly(jet), labels=labels, complete=complete, naxes=jet.shape[1])
+        self._keep(time, readonly(jet), labels, complete)
 
     @property
     def position(self) -> Array:
@@ -284,6 +290,13 @@ class Entries:
             table[np.arange(rows) < counts[:, None]] = joined
         times = readonly(np.fromiter([point.time for point in waypoints], float, len(jets)))
         return cls(times, readonly(table), counts, waypoints[0].labels)
+
+    @classmethod
+    def of_rows(cls, times: Array, rows: Array) -> Entries:
+        """Entries from those by axis, (naxes, order + 1, nwaypoints), which are made read-only."""
+        found = cls(times, readonly(rows).T, np.full(times.size, rows.shape[1]), None)
+        found.__dict__["rows"] = rows  # the cached property needs no copy
+        return found
 
     @cached_property
     def rows(self) -> Array:

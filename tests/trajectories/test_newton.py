@@ -8,6 +8,7 @@ from repetitions import examples
 from trajectory_oracle import Direct, error, miss, waypoints
 
 from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
+from ctrlplan.trajectories.newton import NewtonSystem
 
 # Data drawn at random and every alpha: most of these plans swing, on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
@@ -251,3 +252,22 @@ def test_with_values_may_free_an_entry():
     points = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, None, 0)]
     t = np.linspace(0, 1, 11)
     np.testing.assert_array_equal(plan.with_values(points)(t), TrigSpline(points, alpha=1.0)(t))
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0, 4.0])
+def test_systems_that_amplify_rounding_are_never_taken_for_mild(alpha):
+    """The bound by the squares of the inverse decides as the amplification itself, written out here."""
+    rng, seen = np.random.default_rng(7), set()
+    for count in range(2, 7):
+        for shortest in (1e-4, 1e-2, 0.2):
+            times = np.cumsum(np.append(0.0, rng.uniform(shortest, 1.0, count - 1)))
+            times[1:-1] *= rng.uniform(0.1, 1.0)
+            system = NewtonSystem(alpha, times / times[-1], ((0, 1, 2),) * count)
+            triangle = np.tril(system._triangle)
+            triangle = triangle / np.abs(triangle).max(axis=0)
+            amplification = (np.abs(np.linalg.inv(triangle)) @ np.abs(triangle)).max()
+            if abs(amplification / 1e5 - 1.0) < 1e-3:
+                continue  # within rounding of the limit
+            assert system._is_mild == (amplification < 1e5)
+            seen.add(system._is_mild)
+    assert seen == {False, True}

@@ -145,3 +145,10 @@ def test_waypoints_are_equal_if_they_prescribe_the_same():
     assert short != Waypoint(1.0, [2.0, np.nan])
     free = Waypoint(1.0, np.nan, np.nan)
     assert free == Waypoint.from_dict(free.to_dict()) == Waypoint(1.0, np.nan)
+
+
+def test_a_waypoint_is_constructed_once():
+    point = Waypoint(1.0, [2.0, 3.0], [0.0, 1.0])
+    with pytest.raises(AttributeError, match="immutable"):
+        point.__init__(5.0, [7.0, 7.0])
+    assert point == Waypoint(1.0, [2.0, 3.0], [0.0, 1.0])
