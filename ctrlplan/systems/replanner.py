@@ -375,13 +375,8 @@ class _Correction(SampledBlock):
                 EventName(f"{name}: goal out of reach"): (partial(state_signal, _UNREACHABLE), -math.inf, 0.5),
             },
         )
-        self._plan, self._horizons, self._signals, self._trigger, self._limits = (
-            plan,
-            horizons,
-            signals,
-            trigger,
-            limits,
-        )
+        self._plan, self._horizons, self._signals = plan, horizons, signals
+        self._trigger, self._limits = trigger, limits
         self._bounds = self._bounds_of(horizons.whole) if limits else None
         self._positions = dict(limits).get(0)
         self._passed, self._naxes, self._order = signals.passed, naxes, order
