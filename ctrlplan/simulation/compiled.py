@@ -27,10 +27,8 @@ from ctrlplan.symbolic.many_points import ManyPoints, many_points
 from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
 from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
-_CACHE_SIZE, _INTEGRATORS = 64, 256
-"""Number of cached functions of many times, and of cached integrators (0.1 MB), one for each pattern of output times:
-a plan whose segments end between samples has tens of patterns.
-"""
+_CACHE_SIZE = 64
+"""Number of cached integrators, one for each pattern of output times (0.1 MB), and of cached functions of many times."""
 
 _DIGITS, _NEAR, _EVEN = 12, 1e-9, 1e-4
 """Digits of output times in units of a segment. They are rounded to these digits if their smallest interval is above
@@ -160,7 +158,7 @@ class Compiled:
             trace is not None and block.changes_unseen and trace.depends_on_time()
             for block, trace in zip(network.blocks, traces, strict=True)
         )
-        self._integrators: Lru[tuple[object, ...], Segment] = Lru(_INTEGRATORS)
+        self._integrators: Lru[tuple[object, ...], Segment] = Lru(_CACHE_SIZE)
         self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
         self._small: Lru[tuple[int, str, int], _AtMany] = Lru(_CACHE_SIZE)
         self._by_numpy: Lru[str, ManyPoints | None] = Lru(_CACHE_SIZE)
