@@ -28,7 +28,7 @@ from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
 from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
 _CACHE_SIZE = 64
-"""Number of cached integrators, one for each pattern of output times (0.1 MB), and of cached functions of many times."""
+"""Number of cached integrators (0.1 MB), one a pattern of output times, and of cached functions of many times."""
 
 _DIGITS, _NEAR, _EVEN = 12, 1e-9, 1e-4
 """Digits of output times in units of a segment. They are rounded to these digits if their smallest interval is above
