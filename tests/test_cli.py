@@ -230,6 +230,7 @@ def test_files_can_be_read_by_others(reported):
     assert all(path.stat().st_mode & 0o444 == 0o444 for path in folder.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_the_default_folder_is_called_report(study, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

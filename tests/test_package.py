@@ -324,6 +324,7 @@ def test_every_file_says_what_it_is(path):
     assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
 
 
+@pytest.mark.slow
 def test_documents_that_are_cited_are_in_the_repository():
     """Whoever reads a file has the documents that it refers to."""
     folders = [PROJECT / "ctrlplan", PROJECT / "tests", PROJECT / "notebooks"]

@@ -418,6 +418,7 @@ def straight(speed):
     return cp.PolySpline(points)
 
 
+@pytest.mark.slow
 def test_a_stop_between_nodes_is_found_on_a_straight_line_with_another_slow_point():
     """Speed (t - t_1)^2 ((t - 3/4)^2 + 1e-5): it is 0 at t_1, and small at a node of the grid."""
     stop = 0.37113
@@ -596,6 +597,7 @@ def test_flags_states_and_jets_of_wrong_sizes():
         flat.quantities(np.full((5, 2, 3), np.nan))
 
 
+@pytest.mark.slow
 def test_many_flags_together_have_the_states_of_formulas():
     """More flags than are connected one by one, of a plan far from the operating point, in any order."""
     quadrotor = cp.plants.PlanarQuadrotor(mass=1.0)

@@ -215,6 +215,7 @@ def test_derived_maps_at_rest_say_what_to_do():
         crane.states_and_inputs(falling, [1.0])
 
 
+@pytest.mark.slow
 def test_a_kink_that_the_path_leaves_is_named():
     """abs(v) is replaced by v at the operating point, which does not hold in backward travel."""
     plant = system("bent", "x y th", "v w", lambda x, y, th, v, w: [v * np.cos(th), v * np.sin(th), w * np.abs(v)])

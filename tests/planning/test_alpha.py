@@ -107,6 +107,7 @@ def test_trigonometric_splines_have_smaller_peak_jerk_and_snap(name, alpha, valu
     assert abs(near[values.argmin()] - found.alpha) <= 0.002
 
 
+@pytest.mark.slow
 def test_crane_path_is_minimal_to_a_millionth_of_its_length():
     found = cp.choose_alpha(OBSTACLE, "path")
     alphas = np.concatenate([np.linspace(0, 6.27, 150), np.linspace(found.alpha - 0.05, found.alpha + 0.05, 41)])
@@ -172,6 +173,7 @@ def test_many_random_waypoints_have_no_better_alpha(seed, name):
     check_global(seed, cp.PiecewiseSpline if seed % 3 == 0 else cp.TrigSpline, name, 150)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["path", "wandering"])
 def test_straight_moves_tie_and_the_jerk_is_minimised(name):
     straight = [Waypoint(0, [0, 0], 0, 0), Waypoint(2, [3, 4], 0, 0)]
@@ -315,6 +317,7 @@ def test_an_error_of_the_objective_is_its_own():
         cp.choose_alpha(REST, broken)
 
 
+@pytest.mark.slow
 def test_singular_alphas_are_left_out():
     # Position and speed at the ends, acceleration alone between: singular at alphas that the data decide.
     waypoints = [Waypoint(0, None, 0), Waypoint(1, 1, None), Waypoint(2, None, 3)]
@@ -395,6 +398,7 @@ def test_auto_is_the_shortest_path(family):
     np.testing.assert_array_equal(again(t), plan(t))
 
 
+@pytest.mark.slow
 def test_auto_with_options():
     plan = cp.TrigSpline(OBSTACLE, alpha="auto", gamma=1.0, labels=["a", "b"])
     assert plan.alpha == cp.choose_alpha(OBSTACLE, gamma=1.0).alpha

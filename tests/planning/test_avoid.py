@@ -170,6 +170,7 @@ def test_a_slalom_of_nine_walls(order):
     assert (height * (-1.0) ** np.arange(9) < -1.19).all()
 
 
+@pytest.mark.slow
 def test_fewer_via_points_than_walls_are_said():
     plan = cp.PiecewiseSpline(rest([0.0, 0.0], [36.0, 0.0]))
     with pytest.raises(ValueError, match=r"no plan with 2 via points or fewer and a clearance of 0\.2 was found"):
@@ -229,6 +230,7 @@ def test_waypoints_of_the_user_stay_with_all_entries():
     check(plan, avoid(plan, obstacles, clearance=0.4).plan, obstacles, gap=0.4)
 
 
+@pytest.mark.slow
 def test_there_and_back():
     points = [cp.Waypoint(0, [0, 0], 0, 0), cp.Waypoint(8, [10, 0], 0, 0), cp.Waypoint(16, [0, 0], 0, 0)]
     plan = cp.PolySpline(points)

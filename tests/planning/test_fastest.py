@@ -603,6 +603,7 @@ def test_a_search_that_ends_where_limits_come_nearer_says_so():
 # The report
 
 
+@pytest.mark.slow
 def test_report():
     found = fastest(MOVE, {"y_d1": 0.5, "y_d2": 2.0})
     text = " ".join(str(found).split())

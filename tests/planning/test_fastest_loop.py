@@ -76,6 +76,7 @@ def test_islands_of_feasible_durations():
         assert start - step <= found.duration <= start + 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("span", [None, (0.38, 2.0), (0.64, 2.0)])
 def test_first_of_each_island(span):
     """The limit is attained at the minimum duration, and violated at all shorter ones of the search."""
@@ -161,6 +162,7 @@ def check_random(seed, count, steps):
     assert -1e-4 <= at <= 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", one_in(2, [2, 3, 104, 103]))
 def test_random_loops(seed):
     check_random(seed, 100, 400)
@@ -172,6 +174,7 @@ def test_many_random_loops(seed):
     check_random(100 + seed, 1000, 500)
 
 
+@pytest.mark.slow
 def test_sum_of_signals_is_a_region():
     """An edge of a region limits a sum: two axes that move together stay within a diamond."""
     loop = ct.ss(
@@ -238,6 +241,7 @@ def test_no_overshoot_at_all():
     assert cp.margins(QUINTIC, {"y": (0.0, 1.0)}, loop).satisfied
 
 
+@pytest.mark.slow
 def test_integrators():
     """A double integrator behind a lag, fed by the acceleration of the plan: the acceleration is that of the lag."""
     a, b = np.array([[-20.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0.0, 0.0, 20.0], [0, 0, 0], [0, 0, 0]])
@@ -272,6 +276,7 @@ def test_a_gain_alone():
         cp.fastest(QUINTIC, {"y": (-1.0, 3.0)}, gain)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [1e-4, 1e-6])
 def test_hardly_damped_mode(damping):
     """The overshoot after the move is that of the undamped mode, in closed form, up to the damping."""
@@ -287,6 +292,7 @@ def test_hardly_damped_mode(damping):
     assert found.active.bound.name == "y"
 
 
+@pytest.mark.slow
 def test_far_from_the_origin():
     """Positions of a million with a range of 1, at a time of a million seconds."""
     far = cp.PolySpline([Waypoint(1e6, 1e6, 0, 0), Waypoint(1e6 + 1, 1e6 + 1, 0, 0)])
@@ -303,6 +309,7 @@ def test_waypoints_held():
     assert held.duration == pytest.approx(shape.duration, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_satisfied():
     with pytest.raises(ValueError, match=r"hold=\"path\" must be local in time, got those of y, of a signal of a loop"):
         cp.fastest(QUINTIC, {"y": (None, 1.01)}, SERVO, hold="path")

@@ -48,6 +48,7 @@ def dense(plan, count=300_001, tail=2.0):
 # Names
 
 
+@pytest.mark.slow
 def test_a_name_is_that_of_the_loop():
     """The default label y of the plan is never meant: y of the loop oscillates beyond the plan."""
     t, signals = dense(MOVE)
@@ -133,6 +134,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", [LINEAR, WRITTEN], ids=["exact", "simulated"])
 def test_every_kind_against_dense_samples(loop):
     t, signals = dense(MOVE)
@@ -153,6 +155,7 @@ def test_every_kind_against_dense_samples(loop):
     assert edge.value == pytest.approx((u + slope * y).max(), abs=1e-6 * np.ptp(u + slope * y))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", [LINEAR, WRITTEN], ids=["exact", "simulated"])
 def test_an_interval_and_a_table(loop):
     t, signals = dense(MOVE)
@@ -185,6 +188,7 @@ def test_simulated_extremes_of_oscillating_loops(w, zeta):
         assert simulated.rms(name) == pytest.approx(exact.rms(name), rel=1e-8)
 
 
+@pytest.mark.slow
 def test_the_dwell_counts_in_a_loop():
     signals = dense(MOVE, tail=3.0)[1]
     exact, simulated = (
@@ -475,6 +479,7 @@ def test_a_source_inside_the_loop_is_the_plan():
         fastest(TRACK, {"u": 30.0}, loop)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", [LINEAR, WRITTEN], ids=["exact", "simulated"])
 def test_a_figure_shows_the_signals_of_the_loop(loop):
     t, signals = dense(MOVE)

@@ -79,6 +79,7 @@ def test_a_linear_fractional_current_is_proved_and_a_voltage_is_not():
     )
 
 
+@pytest.mark.slow
 def test_a_pole_in_the_range_is_not_proved():
     def divided(p=1.0):
         return lambda jet: {"q": jet[1, 0] / (p + 2.0)}
@@ -87,6 +88,7 @@ def test_a_pole_in_the_range_is_not_proved():
     assert margins(MOVE, {"q": 1e9}, divided, params={"p": (-3.0, 1.5)}).coverage.startswith("sampled")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "function",
     [
@@ -125,6 +127,7 @@ def test_operations_on_a_parameter_against_numbers():
             forbidden(Rational.parameter(1.0))
 
 
+@pytest.mark.slow
 def test_the_load_of_a_crane():
     crane = cp.plants.Crane()
     params = {"load_mass": (400, 700), "trolley_friction": (0.0, 60.0), "gravity": 9.80}

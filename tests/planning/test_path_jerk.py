@@ -109,6 +109,7 @@ def test_limits_are_satisfied_on_random_paths(count, naxes):
     np.testing.assert_allclose(found.plan(np.linspace(found.plan.start, found.plan.end, 501)), plan(s), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_different_limits_by_sign_and_position():
     limits = {"y_d2": (-1.0, 3.0), "y_d3": cp.Limits(low=[-20.0, -10.0], high=[20.0, 10.0], along=[0.0, 1.0])}
     found = fastest(move(2), limits, hold="path")
@@ -139,6 +140,7 @@ def test_the_start_time_does_not_matter(start):
     assert found.plan.start == start
 
 
+@pytest.mark.slow
 def test_stops_and_dwells_remain():
     dwell = PolySpline([Waypoint(0, 1, 0, 0), Waypoint(2.0, 1, 0, 0)])
     on = PolySpline([Waypoint(0, 1, 0, 0), Waypoint(1, 2, 0, 0)])

@@ -501,6 +501,7 @@ LAUNCH = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 1, 0)])
 FASTER = PolySpline([Waypoint(0, 0, 0.5, 0), Waypoint(1, 1, 1, 0)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plan", "limits", "ends", "best"),
     [
@@ -535,6 +536,7 @@ def test_a_sign_of_the_acceleration_that_every_law_has(plan, limit, ends, messag
         fastest(plan, {"y_d1": 2.0, "y_d2": limit}, hold="path", ends=ends)
 
 
+@pytest.mark.slow
 def test_axes_with_times_that_differ_by_rounding():
     """Segments between such times are no part of the path, wherever the plan starts."""
     one = random_path(4, 1, 5)

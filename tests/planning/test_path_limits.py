@@ -167,6 +167,7 @@ def test_the_fastest_parking_manoeuvre():
     plt.close(drawn.figure)
 
 
+@pytest.mark.slow
 def test_durations_that_are_given():
     limits = {"velocity": 2.0, "acceleration": 1.0}
     longer = cp.fastest(STRAIGHT, limits, hold="path", durations=(20.0, 30.0))

@@ -61,6 +61,7 @@ def ropes(axes):
     return [line.get_xydata() for line in axes.lines if line.get_color() == "#888888"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drum", [0.05, 0.25, 1.5])
 def test_ropes_leave_the_drum_that_was_simulated_and_end_at_the_load(drum):
     found = compared(MOVE, crane=wide(drum))
@@ -96,6 +97,7 @@ def test_a_parameter_of_the_run_is_drawn_as_it_ran():
     assert json.loads(animation_data(found))["b"] == pytest.approx(0.3, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_cranes_that_differ_are_each_drawn_as_they_are():
     drums = {"polynomial": 0.25, "trigonometric": 1.0}
     plans = {"polynomial": cp.PolySpline(MOVE), "trigonometric": cp.TrigSpline(MOVE, alpha=1.0)}
@@ -112,6 +114,7 @@ def dashed(axes):
     return sorted(line.get_ydata()[0] for line in axes.lines if line.get_linestyle() == "--")
 
 
+@pytest.mark.slow
 def test_limits_drawn_are_those_of_the_loop():
     plans = {"jump": cp.Step([20.0, 11.0], [0.0, 10.0], labels=["x", "z"])}
     found = compared(MOVE, plans, force_limits=(-12e3, 7e3), torque_limits=(-2.5e3, -200.0))
@@ -227,6 +230,7 @@ def test_the_step_is_left_out_by_what_it_does_and_not_by_its_name():
 # The view
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", one_in(3, [0.1, 1.0, 30.0]))
 def test_the_view_of_the_animation_holds_the_whole_way(scale):
     places = points((-5.0 * scale, 10.0 * scale), (40.0 * scale, 20.0 * scale), step=60.0)
@@ -238,6 +242,7 @@ def test_the_view_of_the_animation_holds_the_whole_way(scale):
     assert 0.6 * width - 1e-3 * scale < height < 1.25 * width + 1e-3 * scale
 
 
+@pytest.mark.slow
 def test_a_small_crane_is_animated_as_well_as_a_large_one():
     places = points((0.0, 0.1), (0.002, 0.1))
     data = json.loads(animation_data(compared(places, crane=wide(1e-3))))
@@ -259,6 +264,7 @@ def test_the_view_is_neither_a_strip_nor_a_tower(places):
         assert top < z < top + height
 
 
+@pytest.mark.slow
 def test_a_run_that_leaves_the_range_of_numbers_is_drawn_up_to_there():
     found = compared(MOVE)
     known = found.responses["polynomial"]
@@ -274,6 +280,7 @@ def test_a_run_that_leaves_the_range_of_numbers_is_drawn_up_to_there():
     assert len(data["plans"]["polynomial"][0]) == math.ceil(known.time[149] * data["rate"])
 
 
+@pytest.mark.slow
 def test_a_long_run_has_no_more_frames_than_can_be_played():
     found = compared(MOVE)
     known = found.responses["polynomial"]

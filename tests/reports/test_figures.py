@@ -354,6 +354,7 @@ def test_the_legend_names_every_plan_once(compared, swept):
 # Plans
 
 
+@pytest.mark.slow
 def test_labels_of_plans_carry_units(compared, two_axes):
     labels = [axes.get_ylabel() for axes in axes_of(plot_plans(compared))]
     assert labels == ["x position [m]", "x velocity [m/s]", "x acceleration [m/s²]"]
@@ -544,6 +545,7 @@ def test_figure_1_is_the_plane_of_settling_and_overshoot(swept):
     )
 
 
+@pytest.mark.slow
 def test_gains_beside_the_circles_can_be_read(swept):
     with page_style():
         figure = plot_plane(swept, numbered=NUMBERED).figure

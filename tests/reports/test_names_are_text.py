@@ -115,6 +115,7 @@ def test_nor_where_figures_are_drawn(offset, plain, read):
             assert element.attributes.get(key, "#").startswith(("#", "data:,"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.parametrize(
     "names", [("a b", "a-b", "a b"), ("", "!", "?"), ("a", "a-plans", "a-plans-2"), ("\udcff", "-")]

@@ -224,6 +224,7 @@ def test_baselines_of_two_axes_stand_side_by_side():
     np.testing.assert_array_equal(z["S-curve"].get_ydata(), found.responses["S-curve"].outputs[1])
 
 
+@pytest.mark.slow
 def test_drawings_of_a_page_do_not_depend_on_the_users_settings(quintic):
     limited = Limited(quintic, {"y_d1": 1.0})
 

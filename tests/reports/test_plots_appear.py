@@ -177,6 +177,7 @@ def test_a_plot_is_known_to_pyplot_and_current(name):
     assert again.figure is not drawn.figure
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", one_in(3, [name for name in PLOTS if name.endswith(".plot")]))
 def test_a_plot_is_what_savefig_writes(name, tmp_path):
     drawn = PLOTS[name][0]()
@@ -226,6 +227,7 @@ def test_a_figure_that_was_made_and_is_empty_is_drawn_in():
     assert PLAN.plot().figure is not with_title
 
 
+@pytest.mark.slow
 def test_a_title_leaves_the_layout_and_other_figures_alone():
     drawn = cp.TrigSpline(ACROSS, alpha=1.0).plot()
     other, axes = plt.subplots()
@@ -352,6 +354,7 @@ def test_labels_and_titles_of_the_user_stay():
     assert all(a.get_title(loc="left").startswith("my title") for a in axes)
 
 
+@pytest.mark.slow
 def test_a_part_of_a_figure_can_be_drawn_in():
     figure = plt.figure(layout="constrained")
     left, right = figure.subfigures(1, 2)

@@ -163,6 +163,7 @@ def test_a_figure_that_is_svg_already_is_put_in_as_it_is(compared, read):
     assert [circle.attributes["r"] for circle in figure.all("circle")] == ["1"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_a_section_of_ones_own_joins_those_of_a_study_file(tmp_path, read):
     text = 't_end = 6.0\n[loop]\nkind = "linear"\nnum = [5.0]\nden = [1.0, 1.0, 0.0]\n'

@@ -250,6 +250,7 @@ def test_traces_that_are_wrong_far_from_the_start(name):
     right_or_python(block, times, [10.0, 0.0], states, 1e-3 if "lookup" in name else 1e-4)
 
 
+@pytest.mark.slow
 def test_a_branch_that_is_taken_between_the_visited_states():
     """A stop at 9.9 of an oscillation of 10, evaluated at its zero crossing: no symbol may be converted to float."""
     rate = rates_with(stop_at(9.9))

@@ -150,6 +150,7 @@ def test_the_loss_of_digits_is_that_of_half_an_ulp_of_the_matrix(kind, duration)
     assert np.abs(sampled_states(a, b, np.ones((1, 257)), fine, start)[:, ::8] - exact).max() <= bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [9, 1025])
 def test_a_plan_through_a_matrix_far_from_normal(count):
     rng = np.random.default_rng(5)
@@ -200,6 +201,7 @@ def simulated(a, b, t):
     return found, [float(re.search(r"of bent are uncertain by (\S+) %", text)[1]) / 100.0 for text in texts], texts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [300.0, 500.0])
 @pytest.mark.parametrize("count", [9, 65])
 def test_digits_that_a_matrix_far_from_normal_loses_are_said(gain, count):

@@ -430,6 +430,7 @@ def method_of_steps(rate, delays, initial, end, times):
     return np.array([past(t) for t in times])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_bent_loop_with_two_delays(method):
     """x' = 2 y/(1 + y^6) - x + z/2 with y and z the state 2 and sqrt 2 s ago."""

@@ -102,6 +102,7 @@ def test_a_plan_stays_within_its_range_where_a_block_is_undefined_beyond(plan, m
     assert np.abs(found.outputs[:, -1] - expected).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_delayed_signal_stays_within_the_range_of_what_was_delayed(method):
     samples = np.clip(np.sin(7.0 * T), 0.0, 1.0)

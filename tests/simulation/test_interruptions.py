@@ -117,6 +117,7 @@ def test_runs_in_other_threads_leave_handlers_alone():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.slow
 def test_a_handler_that_simulates_the_same_system_does_not_change_the_run(alarm):
     system, t, inner = fast(), np.linspace(0, 0.5, 3), []
     before = signal.getsignal(signal.SIGALRM)

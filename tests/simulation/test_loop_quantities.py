@@ -34,6 +34,7 @@ def lag_error(duration):
     return t, r - particular + particular.subs(t, 0) * sympy.exp(-4 * t)
 
 
+@pytest.mark.slow
 def test_first_order_lag_in_closed_form():
     """The error of the lag is largest during the move, and its root mean square is an integral."""
     t, error = lag_error(2)

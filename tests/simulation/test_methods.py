@@ -297,6 +297,7 @@ def switching():
     return ct.interconnect([one, two, lag], inputs=0, outputs=["a", "y"], name="switching")
 
 
+@pytest.mark.slow
 def test_a_loop_that_appears_later_leaves_nothing_behind():
     ready = cp.prepare(switching())
     calm = np.linspace(0.0, 0.9, 10)

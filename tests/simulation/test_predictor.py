@@ -44,6 +44,7 @@ def by_bisection(x, high):
     return low
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [[0.0, 0.0], [0.2, 0.3], [-0.1, -0.5]])
 def test_the_largest_step_of_a_pendulum(x):
     """The limit is 10 of -10 to 10, kept by a margin of 0.02."""
@@ -56,6 +57,7 @@ def test_the_largest_step_of_a_pendulum(x):
     assert highest_torque(x, kappa) < 10.0
 
 
+@pytest.mark.slow
 def test_the_fraction_is_within_the_resolution_and_below_it_within_a_factor_of_two():
     coarse = cp.Predictor(pendulum(), {"torque": (-10.0, 10.0)}, 8.0)
     exact = by_bisection([0.0, 0.0], 9.8)
@@ -134,6 +136,7 @@ def test_a_prediction_that_fails_is_not_admissible(law):
     assert math.isnan(predictor.fraction([0.4], [3.0], [4.0]))
 
 
+@pytest.mark.slow
 def test_without_casadi_python_says_the_same(monkeypatch):
     predictor = cp.Predictor(pendulum(), {"torque": (-10.0, 10.0)}, 8.0)
     compiled = predictor.fraction([0.0, 0.0], [0.0], [1.0])

@@ -51,6 +51,7 @@ def worst(found, expected):
     return float((np.abs(found - expected) / np.where(size > 0.0, size, 1.0)).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("period", "offset"), [(0.05, 0.0), (0.05, 0.013), (0.1, 0.25)])
 def test_one_rate(period, offset):
     """The plan into controller and plant; its ends lie between samples."""

@@ -185,6 +185,7 @@ def test_an_unstable_loop_that_leaves_the_range_of_numbers():
     assert np.all(found[t >= 7.5] == np.inf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e6])
 @pytest.mark.parametrize("duration", [1.0, 10.0, 100.0])
 def test_a_slow_mode_next_to_a_fast_one(stiffness, duration):

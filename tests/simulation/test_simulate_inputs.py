@@ -91,6 +91,7 @@ def test_samples_at_odd_times():
     assert np.abs(found.outputs - (t - 1 + np.exp(-t))).max() <= 1e-9
 
 
+@pytest.mark.slow
 def test_a_plan_next_to_samples():
     samples = np.random.default_rng(1).normal(size=T.size)
     found = cp.simulate(SYSTEM, T, {"r": PLAN, "d": samples}, START, rtol=1e-11, atol=1e-13)

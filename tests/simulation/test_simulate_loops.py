@@ -85,6 +85,7 @@ def test_a_source_inside_is_as_good_as_an_input():
     assert gap(found.outputs, response(*lag_loop(5.0), signals, T, [0.1, -0.4])[0]) <= 1e-11
 
 
+@pytest.mark.slow
 def test_several_sources_and_inputs():
     """x' = A x + B (d1, d2) + E (p, p', q): the order of blocks, of axes and of derivatives all matter."""
     p, (ps,) = both(*MOVE, 1.0)
@@ -222,6 +223,7 @@ def test_large_gains_in_a_row_are_no_algebraic_loop(gains):
     assert gap(found.outputs, response([[-6.0]], [[1.0]], [[5.0]], [[0.0]], signals, T)[0]) <= 1e-11
 
 
+@pytest.mark.slow
 def test_three_floors():
     """A loop in a loop in a loop, each with a plan of its own."""
     plan, (r,) = both(*MOVE, 1.0)

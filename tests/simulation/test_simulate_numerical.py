@@ -86,6 +86,7 @@ def test_a_linear_loop(each_segment, alpha, rtol, allowed):
     assert gap(found.outputs, outputs) <= allowed
 
 
+@pytest.mark.slow
 def test_the_tolerance_is_obeyed():
     plan, signals = both(*MOVE, 1.0)
     states = response(*lag_loop(5.0), signals, T)[1]
@@ -180,6 +181,7 @@ def test_a_saturated_loop(plan):
     assert np.abs(found.outputs - [states[1], control]).max() <= 1e-5
 
 
+@pytest.mark.slow
 def test_a_plan_inside_a_nonlinear_loop():
     plan = cp.stack([both(*MOVE, 1.0)[0].shift(2.0)], labels=["r"])
     planned_loop = ct.interconnect([cp.create_source_iosystem(plan), saturated()], inputs=0, outputs=["y", "u"])

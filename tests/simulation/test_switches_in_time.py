@@ -91,6 +91,7 @@ def test_a_switch_that_time_and_a_state_decide_together():
         assert np.abs(cp.simulate(block, t, method=method).outputs[0] - expected).max() < 1e-6
 
 
+@pytest.mark.slow
 @examples(15)
 @given(st.floats(0.05, 5.0), st.floats(0.05, 0.95))
 def test_a_train_of_pulses(period, duty):

@@ -44,6 +44,7 @@ def test_to_a_tenth_of_a_millisecond_where_the_log_says_so_much(seed):
     assert abs(found(MOVES, seed, 0.01, -0.1, 3.0).seconds - TRUE) <= 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_the_standard_error_is_that_of_many_logs(rho):
     many = [found(QUINTIC, seed, 0.01, rho=rho) for seed in range(100)]

@@ -498,6 +498,7 @@ def test_an_out_file_that_cannot_be_written(where, capsys, tmp_path):
     assert not list((tmp_path / "plan.csv").iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_a_loop_that_is_unstable_is_no_error(capsys, tmp_path):
     (tmp_path / "study.toml").write_text(to_toml(changed("loop", "gain", to=-5.0)))

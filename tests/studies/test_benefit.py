@@ -275,6 +275,7 @@ def test_limits_given_hold_all():
     assert required(found)["quintic (minimum jerk)"].duration == pytest.approx(15 / 8, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_sign_may_be_a_limit():
     """Never backwards, at most 2 m/s: what `fastest` takes as a limit."""
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
@@ -422,6 +423,7 @@ def test_longer_plans_are_run_longer():
     np.testing.assert_array_equal(grid.durations, [6.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factors", [(0.75, 2.0), (2.0, 0.75)])
 def test_a_shaper_too_slow_for_some_of_the_durations(factors):
     """Period 1.41 s: a move of 2 s leaves room for it, one of 0.75 s does not."""
@@ -641,6 +643,7 @@ def test_further_metrics_can_be_decisive():
     assert found.comparison.metrics["trapezoid"]["half"] < 15 / 8
 
 
+@pytest.mark.slow
 def test_what_cannot_be_asked():
     without = cp.compare(loop(5.0), {"step": cp.Step(1.0)}, TIMES)
     with pytest.raises(ValueError, match=r"comparison must have waypoints, .*got none"):

@@ -77,6 +77,7 @@ def test_only_what_is_missing_runs_in_a_second_call(build, executor, tmp_path):
     assert third.built == []
 
 
+@pytest.mark.slow
 def test_draws_are_stored_with_their_signals(tmp_path):
     expected = drawn(lag)
     same_bits(expected, drawn(lag, tmp_path))

@@ -270,6 +270,7 @@ def test_metrics_scale_with_the_move_and_do_not_move_with_the_clock(standard):
         assert found[plan] == pytest.approx(scaled, rel=1e-7, abs=1e-8, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_times_before_the_plans_begin_do_not_count():
     early = np.union1d(np.linspace(-5, 0, 101), TIMES)
     found = cp.compare(loop(5.0), MOVE, early)
@@ -282,6 +283,7 @@ def test_times_before_the_plans_begin_do_not_count():
 # More axes
 
 
+@pytest.mark.slow
 def test_each_axis_has_its_own_metrics_and_the_worst_stands_first():
     move = [cp.Waypoint.from_jets(0, x=[0, 0, 0], z=[0, 0, 0]), cp.Waypoint.from_jets(1, x=[2, 0, 0], z=[-3, 0, 0])]
     both = cp.compare(two_axes(), move, TIMES)
@@ -317,6 +319,7 @@ def test_an_axis_that_does_not_move_is_undefined_and_hides_no_other():
 # The state that a run begins with
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [5.0, 100.0])
 def test_the_loop_rests_at_the_first_position(gain):
     shifted = [cp.Waypoint(w.time, w.position + 7.0, 0, 0) for w in MOVE]
@@ -337,6 +340,7 @@ def test_a_loop_with_a_constant_error_rests_at_its_own_output():
     assert response.outputs[-1] == pytest.approx(16.0, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_the_loop_rests_at_the_first_position_whatever_its_outputs_are_called():
     shifted = [cp.Waypoint(w.time, w.position + 7.0, 0, 0) for w in MOVE]
     found = cp.compare(loop(5.0, ("u", "e", "y")), shifted, TIMES, controls=["u"])
@@ -379,6 +383,7 @@ def test_an_unstable_loop_is_reported_as_such(num, den, gain, pole, tmp_path):
     assert json.loads((tmp_path / "it.json").read_text())["plans"]["step"]["metrics"]["settling_time"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_a_loop_that_leaves_the_range_of_numbers_is_reported_too(tmp_path):
     found = cp.compare(loop(-1e4), MOVE, np.linspace(0, 30, 301))

@@ -180,6 +180,7 @@ def test_what_a_step_did_outside_the_model_is_not_reported(nominal):
     assert "nan" not in note
 
 
+@pytest.mark.slow
 def test_the_poles_of_the_pids_are_those_of_their_loops(nominal):
     """Roots of (M s^2 + f s) s (Tf s + 1) + (Kp s + Ki)(Tf s + 1) + Kd s^2, gains of a triple pole at -5."""
     said = nominal.parameters["PID controllers"]

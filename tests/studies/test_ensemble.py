@@ -167,6 +167,7 @@ def test_the_nominal_run_has_the_loops_own_parameters(found):
     np.testing.assert_array_equal(found.nominal.responses["ramp"].outputs, alone.responses["ramp"].outputs)
 
 
+@pytest.mark.slow
 def test_order_and_company_of_draws_change_no_bit(found):
     order = np.random.default_rng(0).permutation(21)[:12]
     mixed = run(lag(), {"tau": LAGS["tau"][order]})
@@ -182,6 +183,7 @@ def test_one_draw_is_an_ensemble_too():
         np.testing.assert_allclose(single.bands[plan]["y"], np.tile(curve, (5, 1)), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_bands_of_a_long_run_are_kept_at_some_of_its_times():
     times = np.linspace(0.0, 10.0, 3456)
     long = run(lag(), {"tau": [0.5, 1.0, 2.0]}, times=times)

@@ -104,6 +104,7 @@ def test_a_function_of_the_parameters_is_not_taken_for_one_of_a_plan(build):
         run(build, table)
 
 
+@pytest.mark.slow
 def test_a_builder_may_have_further_arguments_named_as_the_parameters():
     result = run(lambda name, plan, tau=2.0: lag(tau=tau), {"tau": [0.5, 1.0]})
     np.testing.assert_allclose(result.metrics["step"]["settling_time"], np.log(50) * np.array([0.5, 1.0]), rtol=1e-5)
@@ -172,6 +173,7 @@ def test_a_parameter_of_equal_draws_is_looked_for_too(values):
         run(lag(), {"tua": values})
 
 
+@pytest.mark.slow
 def test_equal_draws_of_a_parameter_are_no_mistake():
     result = run(lag(), {"tau": [2.0, 2.0]})
     np.testing.assert_allclose(result.metrics["step"]["iae_final"], 2 * (1 - math.exp(-5)), rtol=1e-5)
@@ -188,6 +190,7 @@ def test_a_limit_far_away_is_a_parameter():
     np.testing.assert_allclose(result.bands["step"]["y"][2, TIMES <= 0.06], 1000.0 * TIMES[TIMES <= 0.06], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_disturbance_that_comes_later_is_a_parameter():
     """Once d is added after 5 s, the lag settles at 1 + d."""
 
@@ -219,6 +222,7 @@ def test_a_loop_that_only_python_runs_is_run_in_this_process(found):
             np.testing.assert_allclose(row, found.metrics[plan][name][:4], rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_loop_that_only_python_runs_can_not_be_sent():
     with pytest.raises(
         ValueError, match="the loop must be picklable for other processes, got lag must be linear or compiled"
@@ -226,6 +230,7 @@ def test_a_loop_that_only_python_runs_can_not_be_sent():
         run(lag_by_python(), {"tau": [0.5, 1.0]}, Elsewhere())
 
 
+@pytest.mark.slow
 def test_a_function_that_cannot_be_pickled_can_not_be_sent():
     with pytest.raises(
         ValueError, match=r"the loop must be picklable for other processes, got .* move the builder into a module"
@@ -233,6 +238,7 @@ def test_a_function_that_cannot_be_pickled_can_not_be_sent():
         run(lambda name, plan: lag_by_python(), {"tau": [0.5, 1.0]}, Elsewhere())
 
 
+@pytest.mark.slow
 def test_a_loop_is_not_taken_for_a_function_that_builds_it():
     loop = ct.nlsys(_lag_rate, _lag_out, states=1, inputs="r", outputs="y", params={"tau": 1.0}, name="lag")
     pickle.dumps(loop)

@@ -107,6 +107,7 @@ def counted(monkeypatch):
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", [None, Elsewhere])
 def test_a_loop_is_built_once_for_all_plans_and_draws(counted, executor):
     run(lag(), cp.draws(6, tau=(0.5, 1.5)), executor and executor())
@@ -114,6 +115,7 @@ def test_a_loop_is_built_once_for_all_plans_and_draws(counted, executor):
     assert counted == {"traced": 2, "compiled": 2, "prepared": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", [None, Elsewhere])
 def test_loops_are_built_once_a_plan(counted, executor):
     built = []
@@ -212,6 +214,7 @@ def test_every_draw_may_fail():
     assert len(result.to_pandas()) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tau", [[1.0, 2.0, 4.0, 6.0], [6.0, 4.0, 2.0, 1.0]], ids=["up", "down"])
 def test_a_parameter_that_counts_only_beyond_a_limit_is_run_too(tau):
     def update(t, x, u, params):
@@ -253,6 +256,7 @@ class Interrupted(Elsewhere):
         return super().answer(k)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
 def test_what_an_executor_found_before_an_interruption_is_kept(found):
     executor = Interrupted(1)
@@ -320,6 +324,7 @@ def test_an_interruption_in_this_process_keeps_what_was_found(monkeypatch, found
     assert np.isnan(result.metrics["ramp"]["iae"][n:]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
 @pytest.mark.parametrize("k", [15, 7])
 def test_an_interruption_in_this_process_loses_no_draw(monkeypatch, k):

@@ -164,6 +164,7 @@ class Pickling(InTurn):
         return super().submit(run)
 
 
+@pytest.mark.slow
 def test_functions_that_only_pickle_rejects_run_where_nothing_is_pickled():
     with ThreadPoolExecutor(2) as pool:
         check(swept(lambda rate: bent(rate), executor=pool), RATES)

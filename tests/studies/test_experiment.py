@@ -210,6 +210,7 @@ def test_the_standard_values_give_other_metrics(way, tmp_path):
 # The value itself
 
 
+@pytest.mark.slow
 def test_linear_loops_together_are_measured_as_by_themselves():
     experiment = cp.Experiment(MOVE, BASE["timepts"])
     loops = [cp.plants.integrator_lag_loop(gain, outputs=("y", "u")) for gain in (0.5, 4.0, 30.0)]
@@ -314,6 +315,7 @@ def test_draws_see_the_events_that_blocks_declare():
     assert (found.metrics["step"]["events"] > 0).all()
 
 
+@pytest.mark.slow
 def test_plans_tie_where_their_values_differ_by_rounding():
     """Of lags behind a step, from the closed form of iae: 1 - exp(-T) in every draw; 0.05 % is no rounding."""
     plans = {"one": cp.Step(1.0), "same": cp.Step(1.0 + 1e-9), "larger": cp.Step(1.0005)}

@@ -112,6 +112,7 @@ def test_sweep_with_params_is_monte_carlo():
     assert found.nominal.benefit.comparison.metrics["step"]["iae"] == pytest.approx(1.0, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_sweep_takes_its_arguments_as_it_did(capsys):
     new = cp.sweep(cp.plants.integrator_lag_loop, [1.0, 5.0], PLANS, TIMES, progress=False, measures=["iae"])
     with pytest.warns(FutureWarning, match="executor= and progress="):

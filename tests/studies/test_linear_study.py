@@ -156,6 +156,7 @@ def test_notes_tell_what_the_numbers_say(study):
         assert percent == pytest.approx(100 * later[nearest].mean(), abs=1.5)
 
 
+@pytest.mark.slow
 def test_the_peak_of_the_overshoot_lies_between_the_gains_swept():
     """Independent integration: lower at both sides of the gain found, and the peak there."""
 

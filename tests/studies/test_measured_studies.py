@@ -60,6 +60,7 @@ def test_logs_are_marked_columns_and_curves(folder, capsys):
     assert found.metrics["poly (measured)"]["control_peak"] != found.metrics["poly"]["control_peak"]
 
 
+@pytest.mark.slow
 def test_a_path_is_enough_where_columns_have_the_labels(folder):
     log = cp.read_log(folder / "poly.csv", time="t_ms", signals=TABLE["signals"], units=TABLE["units"])
     log.export(folder / "plain.npz")
@@ -67,6 +68,7 @@ def test_a_path_is_enough_where_columns_have_the_labels(folder):
     assert found.measured["poly (measured)"].offset == pytest.approx(0.25, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("align", "offset"), [(0.1, 0.1), (False, 0.0), (True, 0.25), ("auto", 0.25)])
 def test_alignment(align, offset, folder):
     found = load_study(write(folder, measured={"poly": TABLE | {"align": align}})).run().comparison

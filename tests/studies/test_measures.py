@@ -147,6 +147,7 @@ def test_signals_with_and_without_a_unit_are_not_ranked_together():
     assert ["Control effort (M)", ""] in titles
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", ["y", "y[0]"], ids=["of the axis", "of the output"])
 def test_the_unit_of_an_output_is_that_of_its_metrics(label):
     """Also of an output that no axis is named like."""
@@ -311,6 +312,7 @@ def test_a_metric_is_added_by_one_entry_of_the_list(monkeypatch, tmp_path):
     np.testing.assert_allclose(swept.metrics["polynomial"]["late"], [1 / 2, 1 / 4, 1 / 10], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_metric_of_one_comparison_is_computed_and_swept():
     measures = {"late": Measure("Error at the end", "{y}", "response", late)}
     closed = cp.plants.unity_feedback_loop([1.0], [1.0, 1.0], 3.0)

@@ -162,6 +162,7 @@ def test_an_unknown_kind_is_an_error_of_usage(tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_progress_says_what_runs(written, capsys):
     written("fastest")

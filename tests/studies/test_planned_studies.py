@@ -130,6 +130,7 @@ def test_a_limit_of_the_crane_is_one_of_the_plan(loaded):
     assert np.abs(crane.quantities(jets)["F"]).max() == pytest.approx(6000.0, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_drawings")
 def test_margins_and_the_fastest_plan_are_in_the_report(loaded):
     plans = [quintic(fastest="shape"), quintic(name="slow")]
@@ -153,6 +154,7 @@ def test_margins_and_the_fastest_plan_are_in_the_report(loaded):
     assert re.search(r"<td[^>]*>satisfied</td>", page)
 
 
+@pytest.mark.slow
 def test_a_plan_slower_than_its_waypoints_is_measured_to_its_end(loaded):
     """Straight in one axis: its path has the length of the polyline, and its load moves until the end of the plan."""
     setting = {"plans": [quintic(fastest="shape")], "limits": {"velocity": 1.0}, "t_end": 50.0, "samples": 501}
@@ -190,6 +192,7 @@ def build() -> ct.StateSpace:
 """
 
 
+@pytest.mark.slow
 def test_a_plan_is_led_around_the_obstacles(loaded, tmp_path):
     (tmp_path / "two_axes.py").write_text(TWO_AXES)
     obstacle = {"shape": "rectangle", "x": [8.0, 12.0], "z": [-3.0, 1.0]}

@@ -185,6 +185,7 @@ def test_where_the_zero_state_is_no_equilibrium_a_plan_from_0_starts_elsewhere()
     np.testing.assert_allclose(y[BEFORE <= 0.0], -0.981, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_what_only_python_control_runs_rests_too():
     class Own(ct.NonlinearIOSystem):
         def _rhs(self, t, x, u):
@@ -284,6 +285,7 @@ def test_a_run_that_fails_for_want_of_a_start_says_so():
     assert any("no equilibrium" in note and "initial_state=" in note for note in getattr(caught.value, "__notes__", ()))
 
 
+@pytest.mark.slow
 def test_each_draw_rests_at_its_own_parameters():
     table = {"c": np.array([2.0, 5.0])}
     first = {

@@ -356,6 +356,7 @@ def build() -> ct.StateSpace:
 """
 
 
+@pytest.mark.slow
 def test_a_loop_is_found_next_to_the_file(tmp_path):
     (tmp_path / "hoist_loop.py").write_text(LOOP.format(rate=4.0))
     path = tmp_path / "study.toml"

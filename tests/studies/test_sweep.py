@@ -38,6 +38,7 @@ def same(one, other):
             np.testing.assert_allclose(row, other.metrics[plan][name], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_each_value_is_a_comparison_of_its_own(swept):
     assert swept.values.tolist() == GAINS
     for i, gain in enumerate(GAINS):
@@ -551,6 +552,7 @@ def test_results_are_plain_and_null_where_infinite():
     assert data["step"]["settling_time"] == [None, found.metrics["step"]["settling_time"][1]]
 
 
+@pytest.mark.slow
 def test_merged_sweeps_stand_in_order(swept):
     odd = cp.sweep(BUILD, [0.5, 10.0, 50.0], PLANS, TIMES, progress=False)
     both = cp.sweep(BUILD, [0.5, 1.0, 5.0, 10.0, 20.0, 50.0], PLANS, TIMES, progress=False)

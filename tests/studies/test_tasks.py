@@ -87,6 +87,7 @@ def test_a_worker_that_has_not_received_the_runs_is_sent_them(monkeypatch):
     assert 3 <= len(large) <= 6  # the four in flight when the worker is found to have none
 
 
+@pytest.mark.slow
 def test_all_tasks_are_in_flight_where_the_number_of_workers_is_unknown(monkeypatch):
     executor = Workers(1, monkeypatch, known=False)
     swept(executor)

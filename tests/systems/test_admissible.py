@@ -116,6 +116,7 @@ def test_a_loop_without_states():
     assert abs(found.fraction([], [0.0, 0.0], [1.0, 0.0]) - 0.495) < 1e-7
 
 
+@pytest.mark.slow
 def test_the_set_does_not_depend_on_the_period():
     loop = second_order(0.3)
     sets = [cp.AdmissibleSet(loop, {"y": (-1.0, 1.0)}, dt) for dt in (0.01, 0.3)]
@@ -196,6 +197,7 @@ def test_no_row_is_superfluous():
         assert maximum.status == 3 or -maximum.fun > found.bounds[k] - 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_the_fraction_is_the_farthest_admissible_one(seed):
     rng = np.random.default_rng(100 + seed)

@@ -294,6 +294,7 @@ def test_a_quadrotor_that_loops():
     assert theta[-1] == pytest.approx(4.0 * np.pi, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_car_in_reverse():
     """The same path backwards: at heading pi, with a negative speed and the steering angle of forward travel."""
     plan = cp.PolySpline(

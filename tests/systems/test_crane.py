@@ -153,6 +153,7 @@ def reverse_map():
     return SimpleNamespace(**{k: v for k, v in locals().items() if k != "pull"}, tension=m * pull)
 
 
+@pytest.mark.slow
 def test_the_reverse_map_is_the_geometry_and_newtons_law_symbolically(reverse_map):
     e = reverse_map
     sine, cosine = -e.across * e.m / e.tension, e.hanging * e.m / e.tension  # of theta, as g - z'' > 0

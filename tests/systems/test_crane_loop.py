@@ -54,6 +54,7 @@ def test_loops_are_the_hand_written_right_hand_side(law, wrap):
     np.testing.assert_allclose([found.x_ref, found.z_ref], plan(t), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_saturated_step_is_the_hand_written_right_hand_side():
     plan = cp.Step([20, 11], [0, 10], labels=["x", "z"])
     limits = {"force_limits": (-30e3, 30e3), "torque_limits": (-3e3, 1e3)}
@@ -75,6 +76,7 @@ def test_saturated_step_is_the_hand_written_right_hand_side():
     np.testing.assert_allclose(run(loop, t).states, found.y, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_step_saturates_the_drives_and_slackens_the_rope():
     plan = cp.Step([20, 11], [0, 10], labels=["x", "z"])
     limits = {"force_limits": (-30e3, 30e3), "torque_limits": (-3e3, 1e3)}
@@ -277,6 +279,7 @@ def test_what_does_not_go_together_is_rejected():
         crane_loop(Crane(), one)
 
 
+@pytest.mark.slow
 def test_axes_of_other_names_are_taken_in_order():
     points = [cp.Waypoint(0, [0, 10], [0, 0], [0, 0]), cp.Waypoint(6, [4, 9], [0, 0], [0, 0])]
     loop = crane_loop(Crane(), cp.PolySpline(points, labels=["across", "down"]))

@@ -285,6 +285,7 @@ def blown():
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("wrap", "law"), CASES)
 def test_a_loop_in_the_wind_against_its_equations_by_hand(blown, wrap, law, method):
@@ -363,6 +364,7 @@ def test_the_plans_source_as_the_reference_is_the_plain_loop(law, method):
     assert np.array_equal(first, second)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["generator", "dynamic"])
 def test_an_unhurried_time_scaling_as_the_reference_is_the_plain_loop(law):
     """Without errors: the same as the source, to the tolerance of the solver."""

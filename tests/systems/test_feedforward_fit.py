@@ -240,6 +240,7 @@ def test_the_block_is_the_sum_of_its_terms():
     np.testing.assert_allclose(cp.simulate(both, t).outputs[0, moving], expected[moving], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["compiled", "python"])
 def test_the_block_with_a_plan_leads_by_the_delay(method):
     fit = cp.fit_feedforward(logged(delay=0.02), PLAN)

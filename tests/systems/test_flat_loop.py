@@ -52,6 +52,7 @@ def test_the_loop_starts_on_the_plan_and_stays_on_it():
     assert abs(windy.outputs["x"][-1] - 20.0) > 1e-3  # a constant force leaves an error without integral action
 
 
+@pytest.mark.slow
 def test_a_plant_with_maps_of_its_own():
     loop = cp.flat_loop(MOTOR, TURN, poles=[-20, -25, -30])
     t = np.linspace(0.0, 1.2, 13)

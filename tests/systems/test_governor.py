@@ -112,6 +112,7 @@ def test_every_sample_takes_the_largest_fraction(seed):
     assert np.abs(found_r[:, ::2] - np.array(expected).T).max() <= 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "plan",
     [
@@ -157,6 +158,7 @@ def test_the_reference_before_the_first_sample():
     assert np.array_equal(found.states[1], np.where(times < 0.32 - 1e-9, 0.0, 1.0))
 
 
+@pytest.mark.slow
 def test_a_sensor_that_fails_and_comes_back():
     """The measured state is nan from 0.5 to 1 s: the reference is held and events are recorded."""
     governor = cp.create_governor_iosystem(
@@ -182,6 +184,7 @@ def test_a_sensor_that_fails_and_comes_back():
     ]
 
 
+@pytest.mark.slow
 def test_a_state_from_which_nothing_is_admissible():
     """The reference is 0 throughout, so that what would come is what comes: u beyond its limits, or not."""
     start = [0.0, 0.0, 0.0, 0.0, -0.4, 0.5]  # u = -2.5 there

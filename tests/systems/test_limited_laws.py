@@ -113,6 +113,7 @@ def test_limits_that_are_not_reached_change_nothing(name):
             np.testing.assert_allclose(limited.dynamics(0.0, state, u), free.dynamics(0.0, state, u), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_car_with_limits_of_speed_and_steering():
     """It starts 3 m behind and 1 m off its lane: it catches up at its highest speed, and stays in its lane."""
     flat = cp.flat_system(car, ["x", "y"], at={"v": 1.0})
@@ -132,6 +133,7 @@ def test_a_car_with_limits_of_speed_and_steering():
     assert np.hypot(x[-1], y[-1]) < 1e-3
 
 
+@pytest.mark.slow
 def test_rotors_that_enter_by_their_squares_stay_within_their_speeds():
     """A planar quadrotor 2 m below its plan: rotors at most 15 % faster than in hover."""
     flat = cp.flat_system(planar_quadrotor, ["x", "z"], at={"th": 0.0})
@@ -160,6 +162,7 @@ def test_limits_must_contain_the_inputs_at_rest():
         cp.flat_loop(FLAT, lift(), poles=POLES, limits={"C": (-100.0, 100.0)})
 
 
+@pytest.mark.slow
 def test_limits_at_every_heading():
     """A vehicle on almost a full circle at 1 m/s, from 1 m behind: the pairing of outputs and inputs changes."""
     flat = cp.flat_system(CASES["unicycle"].plant, ["x", "y"], at={"v": 1.0})

@@ -348,6 +348,7 @@ def test_a_plan_that_ends_in_motion_meets_its_goal_at_every_fit_time():
         assert np.abs(block_outputs(IN_MOTION, replanner, 7.3, x) - [5.5, 0.8, 0.0]).max() <= 1e-9
 
 
+@pytest.mark.slow
 def test_limits_do_not_count_the_arrival_twice():
     """A goal 1 cm off, with a fifth of the peak speed to spare, is taken at every time."""
     limit = 1.2 * float(IN_MOTION.peak(1)[0])

@@ -159,6 +159,7 @@ def test_shrinking_stops_and_a_goal_moved_too_late_is_an_event():
         assert np.abs(found.outputs[0, t >= 10.0] - 1.2).max() <= 1e-10
 
 
+@pytest.mark.slow
 def test_the_minimum_horizon_is_five_periods_and_half_the_plan_at_most():
     """The last fit of a plant that is measured, by its count."""
     t = np.array([0.0, 10.0])

@@ -97,6 +97,7 @@ def test_limits_hold_on_plans_with_joins_and_for_each_axis_its_own(name):
     assert happened(found, UNREACHABLE)
 
 
+@pytest.mark.slow
 def test_each_axis_has_its_limit():
     plan = cp.PolySpline([Waypoint(0, [0, 0], 0, 0), Waypoint(10, [1, 1], 0, 0)], labels=["x", "z"])
     replanner = cp.create_replanner_iosystem(plan, 0.5, goal_derivatives=0, limits={1: [0.2, 0.6]}, trigger="goal")
@@ -164,6 +165,7 @@ def gap(source, sink, name, begin, end):
     return ct.nlsys(None, seen, inputs=source, outputs=sink, name=name, dt=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_sensor_that_fails_for_a_while(method):
     """Fits at 0 to 3 s; none at 3.5 to 5 s, while the last good plan is held; again from 5.5 s on."""

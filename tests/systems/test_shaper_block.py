@@ -54,6 +54,7 @@ def test_at_constant_frequency_it_is_the_shaped_plan(kind, zeta, measured):
     np.testing.assert_allclose(rows(found)[0], shaper.on_grid(DT)(PLAN)(t), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @kinds
 def test_at_another_constant_frequency_it_is_the_shaper_for_that(kind):
     block = cp.create_shaper_iosystem(KINDS[kind](2.0, 0.05), DT, frequency_input="omega")

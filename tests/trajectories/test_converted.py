@@ -200,6 +200,7 @@ def lane_change():
     return fs.point_to_point(car(), 10, [0, -2, 0], [10, 0], [100, 2, 0], [10, 0], basis=basis)
 
 
+@pytest.mark.slow
 def test_flat_outputs_of_different_degrees(lane_change):
     plan = cp.as_trajectory(lane_change)
     t = RNG.uniform(0.0, 10.0, 40)

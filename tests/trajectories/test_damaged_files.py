@@ -200,6 +200,7 @@ def test_data_that_are_no_json(tmp_path):
             load_trajectory(tmp_path / "plan.json")
 
 
+@pytest.mark.slow
 def test_data_nested_without_end():
     data = MOVE.to_dict()
     for _ in range(5000):

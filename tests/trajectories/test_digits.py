@@ -65,6 +65,7 @@ def test_an_explicit_gamma(alpha, gamma):
     assert error(plan, Direct(times, jets, alpha, gamma=gamma, digits=250), order=2, ntime=13) <= 1e-12
 
 
+@pytest.mark.slow
 def test_every_axis_by_its_own_data():
     """One axis closes, one does not, one leaves an entry free."""
     alpha, times = 6.2831, [0.0, 0.4, 0.7, 1.0]

@@ -283,6 +283,7 @@ def read_ppoly(path):
     return PPoly(np.array(data["c"]), np.array(data["x"]), extrapolate=False), data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [0.5, 3.0, 5.0])
 def test_polynomials_are_within_the_stated_error_of_the_trigonometric_spline(alpha, tmp_path):
     """Against 50 digits. Derivatives at the anchors have errors of their own: 2e-14 of their size."""

@@ -325,6 +325,7 @@ def test_a_noisy_function_is_said_to_be_unresolved(noise):
         MOVE.extrema_of(lambda jet: 1.0 + jet[0, 0] + noise * rng.normal(size=jet.shape[2]), 0)
 
 
+@pytest.mark.slow
 def test_oscillation_without_end_is_said_to_be_unresolved():
     line = PolySpline(waypoints([0.0, 1.0], [[0.0], [1.0]]))
     with pytest.raises(RuntimeError, match="after 20000 pieces"):

@@ -140,6 +140,7 @@ def exact_spline(times, values, size):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1e-1, 1 / 40, 1e-4, 1e-8])
 def test_segments_of_very_different_durations_keep_their_digits(ratio, monkeypatch):
     """Extended precision, which long plans use, against 60 digits."""

@@ -213,6 +213,7 @@ def test_forty_constraints(times, lengths, alpha):
     assert error(plan, Direct(times, jets, alpha, digits=digits), ntime=21) <= 1e-10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [0.0, 1.0, 5.5])
 def test_long_jets_at_one_end_and_close_waypoints_at_the_other(alpha):
     """24 constraints whose order decides between 1e-15 and 1e-11: the nodes must be spread at every stage."""

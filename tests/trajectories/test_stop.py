@@ -391,6 +391,7 @@ def test_a_position_limit_is_reported():
         MOVE.stop(2.0, {"acceleration": 5.0, "jerk": 20.0, "x": cp.Limits(high=7.0)})
 
 
+@pytest.mark.slow
 def test_a_stop_on_the_path_from_beyond_a_limit_warns():
     time = float(MOVE.extrema(2).time_min[0])
     with pytest.warns(UserWarning, match="x_d2 must be within ±2"):
