@@ -85,6 +85,8 @@ Glossary
 from importlib import import_module
 from typing import Any
 
+from ctrlplan import _later
+
 __version__ = "0.2.0"
 
 _EXPORTS = {
@@ -216,9 +218,7 @@ __all__ = sorted([*_HOME, *_FOLDERS])
 def __getattr__(name: str) -> Any:
     if name in _FOLDERS:
         return import_module(f"ctrlplan.{name}")
-    if name not in _HOME:
-        raise AttributeError(f"module 'ctrlplan' has no attribute {name!r}")
-    return getattr(import_module(f"ctrlplan.{_HOME[name]}"), name)
+    return _later.loaded_later(__name__, _HOME)(name)
 
 
 def __dir__() -> list[str]:

@@ -63,9 +63,9 @@ Crane with limited force; an event ends the run if the rope becomes slack:
 (12.0, [])
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from ctrlplan import _later
 from ctrlplan.simulation.equilibrium import equilibrium_at, equilibrium_state, unstable_poles
 from ctrlplan.simulation.events import Event, Occurrence, what_happened
 from ctrlplan.simulation.interpreted import SolverError
@@ -128,10 +128,7 @@ _HOME = {
 """Modules of names that a run does not require; they are loaded when a name is first read."""
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+__getattr__ = _later.loaded_later(__name__, _HOME)
 
 
 def __dir__() -> list[str]:

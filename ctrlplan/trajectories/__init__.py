@@ -13,8 +13,9 @@ Before its start a plan holds its first position, after its end the last, with
 all derivatives zero. Times are in seconds, signals are (channel, time).
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ctrlplan import _later
 
 if TYPE_CHECKING:
     from ctrlplan.trajectories.clipped import Clipped
@@ -124,10 +125,7 @@ _HOME = {
 """Module of each name, loaded when the name is first read."""
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+__getattr__ = _later.loaded_later(__name__, _HOME)
 
 
 def __dir__() -> list[str]:
