@@ -249,6 +249,7 @@ def test_the_version_comes_from_one_place(capsys):
     assert capsys.readouterr().out == f"ctrlplan {cp.__version__}\n"
 
 
+@pytest.mark.slow
 def test_python_m_is_the_same_command(study, tmp_path):
     done = python_m("--version")
     assert (done.returncode, done.stdout, done.stderr) == (0, f"ctrlplan {cp.__version__}\n", "")

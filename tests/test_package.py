@@ -97,6 +97,7 @@ def test_an_import_loads_only_what_is_required(chain):
     fresh("import sys\n" + "".join(steps))
 
 
+@pytest.mark.slow
 def test_names_are_loaded_on_first_use():
     fresh(
         "import sys, ctrlplan as cp\n"

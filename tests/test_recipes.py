@@ -538,6 +538,7 @@ def test_a_recipe_is_in_the_readme_word_for_word(name):
     assert RECIPES[name].says in table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECIPES)
 def test_what_a_recipe_adds_appears(seen, name):
     assert not seen[name], seen[name]

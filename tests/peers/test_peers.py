@@ -217,6 +217,7 @@ def test_calls_are_counted_and_one_that_differs_is_found(own):
     assert "for 1.5" in differing["b_test.py::test_two", 2]
 
 
+@pytest.mark.slow
 def test_the_longest_tests_go_first_and_their_cost_is_shown(own):
     calls, _, printed = own
     assert list(calls) == [f"{name}_test.py::{test}" for name in ("optimal", "b") for test in TESTS_OF_OWN]
@@ -237,7 +238,8 @@ def test_the_check_fails_where_the_table_and_the_run_are_at_odds():
         check(Counter({"a_test.py::test_one": 4}), {key: text for key in differing if key[1] != 5}, table)
 
 
-@pytest.mark.parametrize(("part", "minimum"), [(4, 20), pytest.param(2, 50, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("part", "minimum"), [(4, 20), (2, 50)])
 def test_a_sample_of_its_tests_agrees(part, minimum, tests, tmp_path):
     files, sample = [tests / name for name in SAMPLE], {name: part * number for name, number in SAMPLE.items()}
     calls, differing = run(tmp_path, "-p", "no:xdist", *files, CTRLPLAN_PEERS_SAMPLE=json.dumps(sample))
