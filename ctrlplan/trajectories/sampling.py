@@ -19,15 +19,15 @@ exactly and with 2m + 1 functions: with the angle w from the middle of the arc,
 as even ones are polynomials in cos w, and odd ones are sin w times those. These
 functions are well conditioned for every alpha; at alpha = 0 they are Chebyshev's.
 
-Very many sorted times are divided into cells. In each cell the Taylor series about
-its centre, from the exact jet there, gives the values: by one matrix product for all
-cells if the times are evenly spaced, otherwise by one per cell. All are as accurate
-as the jets: series are truncated below rounding.
+Very many sorted times are divided into cells of as many times each. In each cell
+the Taylor series about its centre gives the values, by few terms: the interpolants
+are evaluated at the centres only. The powers are the same in all cells if the times
+are evenly spaced. All are as accurate as the jets: series are truncated below
+rounding.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -61,6 +61,8 @@ _PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
 _CHUNK = 4104  # the functions stay in the second cache; no power of two, to avoid conflicts between rows
 _SPARSE = 48  # number of times per segment from which a matrix product for each segment is faster
 _COMPARED = 18  # number of breakpoints up to which comparisons with each are faster than searches
+_CELL_SIZES = 1024, 512, 256, 128, 64  # numbers of times per cell: the first with few terms is taken
+_EXTREME = 200.0  # decimal exponent of powers of a duration above which series are not evaluated
 _BLOCK = 16 * _CHUNK  # number of times that are grouped together
 
 
@@ -129,7 +131,7 @@ class Part(NamedTuple):
 
 def sample(
     jet: Callable[[Array, int], Array],
-    interpolant: Interpolant | None,
+    interpolants: Callable[[int, int], Interpolant | None],
     duration: float,
     t: Array,
     orders: tuple[int, int],
@@ -142,8 +144,8 @@ def sample(
     ----------
     jet : callable
         Maps times (ntime,) and an order to (order + 1, naxes, ntime).
-    interpolant : Interpolant or None
-        Of these derivatives; None if they are not resolved.
+    interpolants : callable
+        Maps a lowest and a highest order to the `Interpolant` of these derivatives; None if they are not resolved.
     duration : float
         Length [s] of the segment, from 0, in which the function is analytic.
     t : ndarray, shape (ntime,)
@@ -155,15 +157,13 @@ def sample(
     arrangement : Arrangement, optional
         Of the times, if it is known.
     """
+    interpolant = interpolants(*orders)
     if interpolant is None or t.size > (_CELLS if interpolant.rows.shape[1] > _SHORT else MANY):
-        finite = _sample_cells(jet, duration, t, orders, out, arrangement or Arrangement.of(t, duration))
+        order = arrangement or Arrangement.of(t, duration)
+        finite = _sample_cells(jet, interpolants, duration, t, orders, out, order)
         if finite is not None:
             return finite
-    if interpolant is None:
-        _sample_chunks(jet, t, orders, out)
-        return False
-    evaluate([Part(interpolant.rows, 0, t.size, 0.0, duration)], t, out, interpolant.alpha)
-    return interpolant.is_finite
+    return _sample_each(jet, interpolant, duration, t, orders, out)
 
 
 def sample_segments(
@@ -464,30 +464,118 @@ def _products_of_chebyshev(size: int) -> Array:
 
 def _sample_cells(
     jet: Callable[[Array, int], Array],
+    interpolants: Callable[[int, int], Interpolant | None],
     duration: float,
     t: Array,
     orders: tuple[int, int],
     out: Array,
     arrangement: Arrangement,
 ) -> bool | None:
-    """As `sample`, at sorted times by Taylor series in cells; None if times are not sorted, or series too long."""
-    if arrangement is Arrangement.ANY:
-        return None
+    """As `sample`, at sorted times by Taylor series in cells; None if times are not sorted, or series too long.
+
+    The few cells that are longer than others, where times are far apart, are evaluated as other times.
+    """
     low, high = orders
+    if arrangement is Arrangement.ANY or abs(math.log10(duration)) * (high + _MAX_TERMS) > _EXTREME:
+        return None
     size = np.abs(jet(np.linspace(0.0, duration, 9), high + _MAX_TERMS + 2)).max(axis=2)
-    if arrangement is Arrangement.EVEN:
-        step = float(t[-1] - t[0]) / (t.size - 1)
-        for cell in (2048, 1024, 512, 256, 128, 64):
-            terms = _taylor_terms(size, 0.5 * cell * step, low, high)
-            if terms is not None:
-                return _sample_uniform(jet, float(t[0]), step, cell, terms, low, out)
+    for cell in _CELL_SIZES:
+        first, last = t[::cell], np.append(t[cell - 1 :: cell], t[-1])[: -(-t.size // cell)]
+        radius = 0.625 * float(t[-1] - t[0]) / first.size  # some are longer than the mean
+        terms = _taylor_terms(size, radius, low, high)
+        if terms is not None:
+            break
     else:
-        for cell in (4096, 2048, 1024, 512, 256):
-            ncells = -(-t.size // cell)
-            terms = _taylor_terms(size, 0.5 * float(t[-1] - t[0]) / ncells, low, high)
-            if terms is not None:
-                return _sample_sorted(jet, t, ncells, terms, low, out)
-    return None
+        return None
+    wide = (last - first > 2.0 * radius).nonzero()[0].tolist()
+    if len(wide) > max(1, first.size // 8):
+        return None
+    centres, exact = 0.5 * (first + last), (low, high + terms - 1)
+    derivatives = np.empty((exact[1] - low + 1, out.shape[1], centres.size))
+    interpolant = interpolants(*orders)
+    finite = _sample_each(jet, interpolant and interpolants(*exact), duration, centres, exact, derivatives)
+    _evaluate_series(_series(derivatives, terms), centres, t, cell, arrangement is Arrangement.EVEN, out)
+    for k in wide:
+        part = slice(k * cell, (k + 1) * cell)
+        finite &= _sample_each(jet, interpolant, duration, t[part], orders, out[:, :, part])
+    return finite and are_finite(_bounds(derivatives, radius, terms))
+
+
+def _sample_each(
+    jet: Callable[[Array, int], Array],
+    interpolant: Interpolant | None,
+    duration: float,
+    t: Array,
+    orders: tuple[int, int],
+    out: Array,
+) -> bool:
+    """As `sample`, by an interpolant, or by jets where there is none."""
+    if interpolant is None:
+        for begin in range(0, t.size, _CHUNK):
+            out[:, :, begin : begin + _CHUNK] = jet(t[begin : begin + _CHUNK], orders[1])[orders[0] :]
+        return False
+    evaluate([Part(interpolant.rows, 0, t.size, 0.0, duration)], t, out, interpolant.alpha)
+    return interpolant.is_finite
+
+
+def _series(derivatives: Array, terms: int) -> Array:
+    """Taylor coefficients (ncells, norders * naxes, terms) from derivatives (norders + terms - 1, naxes, ncells)."""
+    norders = len(derivatives) - terms + 1
+    table = np.empty((derivatives.shape[2], norders, derivatives.shape[1], terms))
+    for k in range(terms):
+        np.divide(derivatives[k : k + norders].transpose(2, 0, 1), FACTORIALS[k], out=table[..., k])
+    return table.reshape(len(table), -1, terms)
+
+
+def _bounds(derivatives: Array, radius: float, terms: int) -> Array:
+    """Bounds of the sums of the magnitudes of all terms, for each order."""
+    powers = radius ** np.arange(terms) / FACTORIALS[:terms]
+    return np.convolve(np.abs(derivatives).max(axis=(1, 2)), powers[::-1], mode="valid")
+
+
+def _evaluate_series(table: Array, centres: Array, t: Array, cell: int, is_even: bool, out: Array) -> None:
+    """Values of Taylor series about the centre of each cell of consecutive times."""
+    terms, whole = table.shape[2], t.size // cell
+    together = 1 if is_even else max(1, 2 * _CHUNK // cell)
+    # The row of memory is longer than its times, to avoid conflicts between rows.
+    basis = np.empty((max(terms, 2), together * cell + 8))[:, :-8].reshape(-1, together, cell)
+    basis[0] = 1.0
+    flat = out.reshape(-1, t.size)  # a view
+    times = t[: whole * cell].reshape(whole, cell)
+    values = flat[:, : whole * cell].reshape(-1, whole, cell).transpose(1, 0, 2)
+    if whole < len(table):
+        _evaluate_cells(table[whole:], centres[whole:], t[None, whole * cell :], basis, flat[None, :, whole * cell :])
+    if is_even and whole:
+        powers = _powers(times[:1], centres[:1], basis)
+        _multiply(table[:whole], powers[:, :terms], values)
+        return
+    for begin in range(0, whole, together):
+        part = slice(begin, min(begin + together, whole))
+        _evaluate_cells(table[part], centres[part], times[part], basis, values[part])
+
+
+def _evaluate_cells(table: Array, centres: Array, t: Array, basis: Array, out: Array) -> None:
+    """Values (ncells, nrows, ntime) of series at times (ncells, ntime)."""
+    powers = _powers(t, centres, basis[:, : len(t), : t.shape[1]])
+    _multiply(table, powers[:, : table.shape[2]], out)
+
+
+def _multiply(table: Array, powers: Array, out: Array) -> None:
+    """Matrix products of all cells, each in one thread."""
+    step = max(1, _PRODUCT // (powers.shape[1] * powers.shape[2]))
+    for row in range(0, table.shape[1], step):
+        np.matmul(table[:, row : row + step], powers, out=out[:, row : row + step])
+
+
+def _powers(t: Array, centres: Array, out: Array) -> Array:
+    """Powers (ncells, size, ntime) of the distances of times (ncells, ntime) from the centres of cells."""
+    np.subtract(t, centres[:, None], out=out[1])
+    top, size = 1, len(out)
+    while top + 1 < size:  # x^(top + k) = x^top x^k doubles the number in each pass
+        more = min(top, size - 1 - top)
+        np.multiply(out[1 : more + 1], out[top], out=out[top + 1 : top + more + 1])
+        top += more
+    return out.transpose(1, 0, 2)
 
 
 def sample_in_batches(plan: Trajectory, t: Array, low: int, high: int, left: bool) -> Array:
@@ -515,13 +603,13 @@ def _is_uniform(t: Array, duration: float) -> bool:
     slack = 4.0 * np.finfo(float).eps * duration
     if not step > 2.0 * slack or abs(t[1] - t[0] - step) > slack:
         return False
-    ramp = step * np.arange(min(t.size, 2 * _CHUNK))
+    ramp = step * np.arange(min(t.size, 8 * _CHUNK))
     beyond = np.empty_like(ramp)
     for first in range(0, t.size, ramp.size):
         part = t[first : first + ramp.size]
         excess = np.subtract(part, ramp[: part.size], out=beyond[: part.size])
         base = t[0] + first * step
-        if not (excess.max() - base <= slack and base - excess.min() <= slack):
+        if not (np.maximum.reduce(excess) - base <= slack and base - np.minimum.reduce(excess) <= slack):
             return False
     return True
 
@@ -548,66 +636,3 @@ def _taylor_terms(size: Array, radius: float, low: int, high: int) -> int | None
     # Two terms in a row, so that an odd or even function does not end its series early.
     done = (small[:, 1:-1] & small[:, 2:]).all(axis=(0, 2))
     return int(done.argmax()) + 1 if done.any() else None
-
-
-def _sample_uniform(
-    jet: Callable[[Array, int], Array], first: float, step: float, cell: int, terms: int, low: int, out: Array
-) -> bool:
-    norders, naxes, count = out.shape
-    ncells = count // cell
-    centres = first + step * (0.5 * (cell - 1) + cell * np.arange(ncells + 1, dtype=float))
-    jets = jet(centres, low + norders + terms - 2)
-    radius = 0.5 * cell * step
-    powers = np.linspace(-1.0 + 1.0 / cell, 1.0 - 1.0 / cell, cell) ** np.arange(terms)[:, None]
-    scale = radius ** np.arange(terms) / FACTORIALS[:terms]
-    main = ncells * cell
-    block = max(1, _PRODUCT // (terms * cell))
-    finite = True
-    for row in range(norders):
-        table = np.ascontiguousarray(np.moveaxis(jets[low + row : low + row + terms], 0, -1) * scale)
-        finite &= are_finite(table)
-        for axis in range(naxes):
-            whole = out[row, axis, :main].reshape(ncells, cell)
-            for begin in range(0, ncells, block):
-                np.matmul(table[axis, begin : min(begin + block, ncells)], powers, out=whole[begin : begin + block])
-            if main < count:
-                np.matmul(table[axis, ncells], powers[:, : count - main], out=out[row, axis, main:])
-    return finite
-
-
-def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, terms: int, low: int, out: Array) -> bool:
-    norders, naxes, _ = out.shape
-    edges: Array = np.linspace(t[0], t[-1], ncells + 1)
-    centres, radius = 0.5 * (edges[:-1] + edges[1:]), 0.5 * float(t[-1] - t[0]) / ncells
-    jets = jet(centres, low + norders + terms - 2)
-    scale = radius ** np.arange(terms) / FACTORIALS[:terms]
-    table = np.stack([np.moveaxis(jets[nu : nu + terms], 0, -1) for nu in range(low, low + norders)]) * scale
-    table = np.moveaxis(table, 2, 0).reshape(ncells, -1, terms)
-    flat = out.reshape(norders * naxes, t.size)  # a view
-    bounds = [0, *np.searchsorted(t, edges[1:-1]).tolist(), t.size]
-    widest = max(1, min(_CHUNK, _PRODUCT // table[0].size))
-    basis = np.empty((max(terms, 2), widest))
-    basis[0] = 1.0
-    for k, (first, last) in enumerate(itertools.pairwise(bounds)):
-        for begin in range(first, last, widest):
-            end = min(begin + widest, last)
-            powers = basis[:, : end - begin]
-            np.subtract(t[begin:end], centres[k], out=powers[1])
-            powers[1] /= radius
-            _powers(powers)
-            np.matmul(table[k], powers[:terms], out=flat[:, begin:end])
-    return are_finite(table)
-
-
-def _powers(functions: Array) -> None:
-    """Powers (size, ntime) from the first two, 1 and x."""
-    top, size = 1, len(functions)
-    while top + 1 < size:  # x^(top + k) = x^top x^k doubles the number in each pass
-        more = min(top, size - 1 - top)
-        np.multiply(functions[1 : more + 1], functions[top], out=functions[top + 1 : top + more + 1])
-        top += more
-
-
-def _sample_chunks(jet: Callable[[Array, int], Array], t: Array, orders: tuple[int, int], out: Array) -> None:
-    for begin in range(0, t.size, _CHUNK):
-        out[:, :, begin : begin + _CHUNK] = jet(t[begin : begin + _CHUNK], orders[1])[orders[0] :]

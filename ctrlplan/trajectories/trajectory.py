@@ -1176,9 +1176,11 @@ class Trajectory(Displayed, Fields, ABC):
         def jet(u: Array, order: int) -> Array:
             return self.segment_jet(segment, u, order)
 
+        def interpolants(lowest: int, highest: int) -> _sampling.Interpolant | None:
+            return self._interpolant(segment, lowest, highest)
+
         orders = low, low + len(out) - 1
-        interpolant, length = self._interpolant(segment, *orders), self._length(segment)
-        finite = _sampling.sample(jet, interpolant, length, s, orders, out, arrangement)
+        finite = _sampling.sample(jet, interpolants, self._length(segment), s, orders, out, arrangement)
         self._place_ends(segment, s, low, out, _sampling.is_increasing(arrangement))
         return finite
 

@@ -159,6 +159,39 @@ def test_against_fifty_digits():
         assert (np.abs(plan.jet(t, 2)[:, 0, some] - exact) / size).max() <= 2e-13
 
 
+@pytest.mark.parametrize("alpha", [0.0, 3.0])
+def test_very_many_times_against_fifty_digits(alpha):
+    """Taylor series in cells: the third derivative too, the last cell short, one cell across a gap."""
+    times, jets = [0.0, 0.3, 1.0], [[0.0, 1.0, 2.0], [1.0, -1.0], [0.5, 0.0, 3.0]]
+    plan, oracle = TrigSpline(waypoints(times, jets), alpha=alpha), Direct(times, jets, alpha)
+    rng, count = np.random.default_rng(7), 300_500
+    given = orders_of(plan, count, rng)
+    inside = given["arbitrary"]
+    given["with a gap"] = np.sort(np.where(inside > 0.5, 0.9 + 0.1 * inside, 0.2 * inside))
+    given["dense at one end"] = np.sort(inside**3)
+    for name, t in given.items():
+        found = plan.jet(t, 3)[:, 0]
+        gap = int(np.diff(t).argmax()) if name != "arbitrary" else 0
+        some = np.unique(np.r_[0 : count : count // 17, gap : gap + 2, count - 500 : count : 100, count - 1])
+        exact = oracle.jet(t[some], 3)
+        size = np.abs(found).max(axis=1, keepdims=True)
+        assert (np.abs(found[:, some] - exact) / size).max() <= 2e-14, name
+
+
+@pytest.mark.parametrize("count", [300_001, 301_056, 302_000])
+def test_cells_of_sorted_times_agree_with_the_jets(count):
+    """Whole cells only, and a last cell of few times; equal times; times that are close together."""
+    plan = random_plan(12, 1.0, naxes=2)
+    rng = np.random.default_rng(5)
+    for name, t in orders_of(plan, count, rng).items():
+        assert disagreement(plan, t, order=3) <= 1, name
+    a, b = plan.start + plan.duration * np.array([0.3, 0.30001])
+    t = np.sort(rng.uniform(a, b, count))
+    assert disagreement(plan, t) <= 1
+    t[1000:9000] = t[1000]
+    assert disagreement(plan, t) <= 1
+
+
 def test_times_that_are_all_the_same():
     plan = random_plan(12, 2.0)
     t = np.full(5000, plan.start + 0.3)
