@@ -14,10 +14,10 @@ coefficients of the other.
 Trigonometric polynomials of degree m on an arc of alpha radians have the same form,
 exactly and with 2m + 1 functions: with the angle w from the middle of the arc,
 
-.. math:: x = 2\,\frac{\sin(w/2)}{\sin(\alpha/4)}, \qquad V_{2k}(x), \quad \cos(w/2)\,V_{2k+1}(x)
+.. math:: x = 2\,\frac{\sin(w/2)}{\sin(\alpha/4)}, \qquad V_{2k}(x), \quad \sin w\,\frac{V_{2k+1}(x)}{x}
 
 as even ones are polynomials in cos w, and odd ones are sin w times those. These
-functions are well conditioned for every alpha; at alpha = 0 they are Chebyshev's.
+functions are well conditioned for every alpha.
 
 Very many sorted times are divided into cells of as many times each. In each cell
 the Taylor series about its centre gives the values, by few terms: the interpolants
@@ -341,6 +341,7 @@ def collocation(alpha: float, size: int) -> Collocation:
     angles = np.arcsin(math.sin(0.25 * alpha) * nodes)  # half of those from the middle
     weights = 1.0 / np.cos(angles)[:, None]  # odd functions are divided by the cosine, which leaves polynomials
     products = 0.5 * (products + products[::-1] + weights * products - weights * products[::-1])
+    products[:, 1::2] *= 1.0 / math.sin(0.25 * alpha)  # x cos(w/2) is sin w over that
     return Collocation(readonly(0.5 + (2.0 / alpha) * angles), readonly(products))
 
 
@@ -403,48 +404,51 @@ def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Arr
 
 
 def _new_basis(size: int, ntime: int, alpha: float) -> Array:
-    """Memory for the functions at some times, with a row more for the cosines."""
-    basis = np.empty((max(size, 2) + (alpha > 0.0), min(_CHUNK, ntime)))
+    """Memory for the functions at some times."""
+    basis = np.empty((max(size, 4 if alpha else 2), min(_CHUNK, ntime)))
     basis[0] = 1.0
     return basis
 
 
 def _scale(t: Array, start: float, duration: Array | float, alpha: float, out: Array) -> None:
-    """Replace by times relative to the middle of their segments, from -2 to 2, or by a quarter of the angle."""
+    """Replace by times relative to the middle of their segments, from -2 to 2, or by half of the angle."""
     if start:
         t = np.subtract(t, start, out)
     np.subtract(t, 0.5 * duration, out)
-    np.divide(out, 4.0 * duration / alpha if alpha else 0.25 * duration, out)
+    np.divide(out, 2.0 * duration / alpha if alpha else 0.25 * duration, out)
 
 
 def _fill(functions: Array, alpha: float) -> None:
     """Fill the basis (size, ntime) from its first two functions, 1 and the scaled time."""
-    top, size = 1, len(functions) - (alpha > 0.0)
+    top, size = 1, len(functions)
     if alpha:
-        _change_to_sines(functions[1], functions[size], alpha)
+        _change_to_sines(functions, alpha)
+        top = 2
     while 2 * top < size:
         square = functions[2 * top]
         np.multiply(functions[top], functions[top], out=square)
         square -= 2.0
-        if alpha and top == 1:
-            functions[1] *= functions[size]
         more = min(2 * top, size - 2 * top)
         np.multiply(functions[1:more], square, out=functions[2 * top + 1 : 2 * top + more])
         top *= 2
 
 
-def _change_to_sines(angle: Array, cosine: Array, alpha: float) -> None:
-    """Replace a quarter of the angle by the scaled sine of half of it, and set the cosine of that.
+def _change_to_sines(functions: Array, alpha: float) -> None:
+    """Replace half of the angle by the sine of the angle, and set the next two functions.
 
-    Both follow from the tangent, whose evaluation is faster than that of a sine and as accurate.
+    They follow from the tangent of the half, whose evaluation is faster than that of a sine and as accurate:
+    sin w = 2z/(1 + z^2) and x^2 = 2 z sin w / sin(alpha/4)^2.
     """
-    np.tan(angle, out=angle)
-    np.multiply(angle, angle, out=cosine)
-    cosine += 1.0
-    np.divide(2.0, cosine, out=cosine)
-    angle *= cosine
-    angle *= 2.0 / math.sin(0.25 * alpha)
-    cosine -= 1.0
+    _, sine, second, tangent = functions[:4]
+    np.tan(sine, out=tangent)
+    np.multiply(tangent, tangent, out=second)
+    second += 1.0
+    np.divide(2.0, second, out=second)
+    np.multiply(tangent, second, out=sine)
+    np.multiply(tangent, sine, out=second)
+    second *= 2.0 / math.sin(0.25 * alpha) ** 2
+    second -= 2.0
+    np.multiply(sine, second, out=tangent)
 
 
 @lru_cache(maxsize=256)
