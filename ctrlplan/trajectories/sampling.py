@@ -30,8 +30,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from enum import Enum, auto
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -50,7 +48,7 @@ FEW = 256
 _CELLS = 30_000
 """Number of sorted times from which cells are faster than an interpolant with many terms."""
 
-MANY = 300_000
+_MANY = 300_000
 """Number of sorted times from which cells are faster than an interpolant with few terms."""
 
 _SHORT = 24
@@ -66,8 +64,7 @@ _EXTREME = 200.0  # decimal exponent of powers of a duration above which series 
 _BLOCK = 16 * _CHUNK  # number of times that are grouped together
 
 
-@dataclass(frozen=True, eq=False)
-class Interpolant:
+class Interpolant(NamedTuple):
     """Interpolants of derivatives on one segment.
 
     Attributes
@@ -91,22 +88,31 @@ class Interpolant:
         return cls(readonly(rows), are_finite(rows), alpha)
 
 
-class Arrangement(Enum):
-    """Order of times.
+class Extent(NamedTuple):
+    """What is known of many times of a segment.
 
-    Evenly spaced ones are so up to rounding, and increase strictly.
+    Attributes
+    ----------
+    first, last : float
+        Smallest and largest time [s]; nan if one is nan.
+    is_sorted : bool
+        Whether no time is below the one before.
     """
 
-    ANY = auto()
-    SORTED = auto()
-    EVEN = auto()
+    first: float
+    last: float
+    is_sorted: bool
 
     @classmethod
-    def of(cls, t: Array, duration: float) -> Arrangement:
-        """Arrangement of times of a segment with a duration."""
-        if _is_uniform(t, duration):
-            return cls.EVEN
-        return cls.SORTED if t[-1] > t[0] and _is_sorted(t) else cls.ANY
+    def of(cls, t: Array) -> Extent:
+        """Extent of one or more times."""
+        if _is_sorted(t):
+            return cls(t.item(0), t.item(-1), True)
+        return cls(t.item(t.argmin()), t.item(t.argmax()), False)
+
+    def since(self, start: float) -> Extent:
+        """Extent of the times since a start."""
+        return Extent(self.first - start, self.last - start, self.is_sorted)
 
 
 class Part(NamedTuple):
@@ -136,7 +142,7 @@ def sample(
     t: Array,
     orders: tuple[int, int],
     out: Array,
-    arrangement: Arrangement | None = None,
+    extent: Extent,
 ) -> bool:
     """Derivatives at many times; whether they are certainly finite.
 
@@ -154,13 +160,12 @@ def sample(
         Lowest and highest order of the derivatives.
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
-    arrangement : Arrangement, optional
-        Of the times, if it is known.
+    extent : Extent
+        Of the times.
     """
     interpolant = interpolants(*orders)
-    if interpolant is None or t.size > (_CELLS if interpolant.rows.shape[1] > _SHORT else MANY):
-        order = arrangement or Arrangement.of(t, duration)
-        finite = _sample_cells(jet, interpolants, duration, t, orders, out, order)
+    if extent.is_sorted and (interpolant is None or t.size > (_CELLS if interpolant.rows.shape[1] > _SHORT else _MANY)):
+        finite = _sample_cells(jet, interpolants, duration, t, orders, out)
         if finite is not None:
             return finite
     return _sample_each(jet, interpolant, duration, t, orders, out)
@@ -376,10 +381,27 @@ def evaluate(parts: Sequence[Part], t: Array, out: Array, alpha: float = 0.0) ->
             place += 1
         _fill(functions, alpha)
         for rows, first, last in inside:
-            step = max(1, _PRODUCT // rows.size)
-            for low in range(first, last, step):
-                high = min(low + step, last)
-                np.matmul(rows, functions[: rows.shape[1], low - begin : high - begin], out=target[:, low:high])
+            _multiply(rows, functions[: rows.shape[1], first - begin : last - begin], target[:, first:last])
+
+
+def _evaluate_one(rows: Array, t: Array, duration: float, out: Array, alpha: float) -> None:
+    """As `evaluate`, at times since the start of one segment."""
+    target = out.reshape(-1, t.size)  # a view
+    basis = _new_basis(rows.shape[1], t.size, alpha)
+    for begin in range(0, t.size, _CHUNK):
+        part = t[begin : begin + _CHUNK]
+        functions = basis[:, : part.size]
+        _scale(part, 0.0, duration, alpha, functions[1])
+        _fill(functions, alpha)
+        _multiply(rows, functions[: rows.shape[1]], target[:, begin : begin + part.size])
+
+
+def _multiply(rows: Array, functions: Array, out: Array) -> None:
+    """Matrix products (..., nrows, ntime), each in one thread."""
+    step = max(1, _PRODUCT // (functions.shape[-2] * functions.shape[-1]))
+    for row in range(0, rows.shape[-2], step):
+        part = slice(row, row + step)
+        np.matmul(rows[..., part, :], functions, out=out[..., part, :])
 
 
 def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Array, out: Array, alpha: float) -> None:
@@ -473,14 +495,13 @@ def _sample_cells(
     t: Array,
     orders: tuple[int, int],
     out: Array,
-    arrangement: Arrangement,
 ) -> bool | None:
-    """As `sample`, at sorted times by Taylor series in cells; None if times are not sorted, or series too long.
+    """As `sample`, at sorted times by Taylor series in cells; None if the series are too long.
 
     The few cells that are longer than others, where times are far apart, are evaluated as other times.
     """
     low, high = orders
-    if arrangement is Arrangement.ANY or abs(math.log10(duration)) * (high + _MAX_TERMS) > _EXTREME:
+    if not t[-1] > t[0] or abs(math.log10(duration)) * (high + _MAX_TERMS) > _EXTREME:
         return None
     size = np.abs(jet(np.linspace(0.0, duration, 9), high + _MAX_TERMS + 2)).max(axis=2)
     for cell in _CELL_SIZES:
@@ -498,7 +519,7 @@ def _sample_cells(
     derivatives = np.empty((exact[1] - low + 1, out.shape[1], centres.size))
     interpolant = interpolants(*orders)
     finite = _sample_each(jet, interpolant and interpolants(*exact), duration, centres, exact, derivatives)
-    _evaluate_series(_series(derivatives, terms), centres, t, cell, arrangement is Arrangement.EVEN, out)
+    _evaluate_series(_series(derivatives, terms), centres, t, cell, _is_uniform(t, duration), out)
     for k in wide:
         part = slice(k * cell, (k + 1) * cell)
         finite &= _sample_each(jet, interpolant, duration, t[part], orders, out[:, :, part])
@@ -518,7 +539,7 @@ def _sample_each(
         for begin in range(0, t.size, _CHUNK):
             out[:, :, begin : begin + _CHUNK] = jet(t[begin : begin + _CHUNK], orders[1])[orders[0] :]
         return False
-    evaluate([Part(interpolant.rows, 0, t.size, 0.0, duration)], t, out, interpolant.alpha)
+    _evaluate_one(interpolant.rows, t, duration, out, interpolant.alpha)
     return interpolant.is_finite
 
 
@@ -562,13 +583,6 @@ def _evaluate_cells(table: Array, centres: Array, t: Array, basis: Array, out: A
     """Values (ncells, nrows, ntime) of series at times (ncells, ntime)."""
     powers = _powers(t, centres, basis[:, : len(t), : t.shape[1]])
     _multiply(table, powers[:, : table.shape[2]], out)
-
-
-def _multiply(table: Array, powers: Array, out: Array) -> None:
-    """Matrix products of all cells, each in one thread."""
-    step = max(1, _PRODUCT // (powers.shape[1] * powers.shape[2]))
-    for row in range(0, table.shape[1], step):
-        np.matmul(table[:, row : row + step], powers, out=out[:, row : row + step])
 
 
 def _powers(t: Array, centres: Array, out: Array) -> Array:
@@ -618,15 +632,11 @@ def _is_uniform(t: Array, duration: float) -> bool:
     return True
 
 
-def is_increasing(arrangement: Arrangement | None) -> bool:
-    """Whether times are known to be sorted."""
-    return arrangement in (Arrangement.SORTED, Arrangement.EVEN)
-
-
 def _is_sorted(t: Array) -> bool:
-    """Whether no time is below the one before; of times in any order the first ones say so."""
-    first = t[:FEW]
-    return bool((first[1:] >= first[:-1]).all()) and bool((t[1:] >= t[:-1]).all())
+    """Whether no time is below the one before; of times in any order a few say so."""
+    if not t.item(0) <= t.item(t.size // 2) <= t.item(-1):
+        return False
+    return (t.size <= _CHUNK or _is_sorted(t[:FEW])) and int(np.count_nonzero(t[1:] >= t[:-1])) == t.size - 1
 
 
 def _taylor_terms(size: Array, radius: float, low: int, high: int) -> int | None:
