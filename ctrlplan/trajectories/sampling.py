@@ -398,10 +398,10 @@ def _evaluate_one(rows: Array, t: Array, duration: float, out: Array, alpha: flo
 
 def _multiply(rows: Array, functions: Array, out: Array) -> None:
     """Matrix products (..., nrows, ntime), each in one thread."""
-    step = max(1, _PRODUCT // (functions.shape[-2] * functions.shape[-1]))
-    for row in range(0, rows.shape[-2], step):
-        part = slice(row, row + step)
-        np.matmul(rows[..., part, :], functions, out=out[..., part, :])
+    step = max(1, _PRODUCT // (rows.shape[-2] * rows.shape[-1]))
+    for begin in range(0, out.shape[-1], step):
+        part = slice(begin, begin + step)
+        np.matmul(rows, functions[..., part], out=out[..., part])
 
 
 def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Array, out: Array, alpha: float) -> None:
