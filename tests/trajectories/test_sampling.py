@@ -399,6 +399,35 @@ def test_ends_have_the_entries_of_waypoints_in_every_bit(kind):
         assert (np.abs(plan.jet(end, 2) - nearby) <= slack).all()
 
 
+@pytest.mark.parametrize("kind", ENDS)
+@pytest.mark.parametrize("count", [300, 2000])
+def test_ends_among_many_times_in_any_order(kind, count):
+    """Once, many times or never, sorted or not: the entries there in every bit, and other values elsewhere."""
+    rng = np.random.default_rng(14)
+    jets = rng.normal(size=(3, 3, 2))
+    for marks in ([0.3, 1.0, 2.1], [0.0, 1.0, 2.1]):
+        plan = ENDS[kind]([Waypoint(t, *jet) for t, jet in zip(marks, jets, strict=True)])
+        inside = rng.uniform(*plan.breakpoints[[0, -1]], count)
+        begin, end = np.full(count // 3, plan.start), np.full(count // 4, plan.end)
+        given = {
+            "both once": np.r_[plan.start, np.sort(inside), plan.end],
+            "both many times": np.r_[begin, np.sort(inside), end],
+            "start only": np.r_[plan.start, np.sort(inside)],
+            "end only": np.r_[np.sort(inside), end],
+            "neither": inside,
+            "mixed": rng.permutation(np.r_[begin, inside, end]),
+            "one inside": np.r_[inside, plan.end, inside],
+            "descending": np.sort(np.r_[plan.start, inside, plan.end])[::-1],
+            "only starts": begin if begin.size > 256 else np.repeat(begin, 3),
+        }
+        for name, t in given.items():
+            found = plan.jet(t, 2)
+            for moment, jet in ((plan.start, jets[0]), (plan.end, jets[2])):
+                assert (found[:, :, t == moment] == jet[:, :, None]).all(), name
+            few = np.concatenate([plan.jet(part, 2) for part in np.array_split(t, 10)], axis=2)
+            assert (np.abs(found - few) <= 1e-12 * np.abs(few).max(axis=2, keepdims=True)).all(), name
+
+
 def times_of_segments(plan, count, rng):
     """Times that are hard to assign to segments."""
     marks, inside = plan.breakpoints, rng.uniform(plan.start, plan.end, count)
