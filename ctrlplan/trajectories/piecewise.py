@@ -445,7 +445,8 @@ class PiecewiseSpline(WaypointSpline):
     def _exponent(self) -> float:
         """Maximum magnitude of the decimal exponents of the durations."""
         durations = self._durations
-        return max(abs(math.log10(durations.min())), abs(math.log10(durations.max())))
+        shortest, longest = durations.item(durations.argmin()), durations.item(durations.argmax())
+        return max(abs(math.log10(shortest)), abs(math.log10(longest)))
 
     def _jets(self, segments: NDArray[np.intp], s: Array, low: int, high: int) -> Array:
         """Derivatives low to high, each time in its own segment."""
@@ -531,7 +532,7 @@ class PiecewiseSpline(WaypointSpline):
             out = np.zeros((segments.size, high - low + 1, self.naxes, max(rows.shape[3] for rows in found)))
             for pieces, rows in zip(self._pieces, found, strict=True):
                 out[:, :, list(pieces.axes), : rows.shape[3]] = rows
-        powers = scales_of_orders(self._durations[segments, None, None, None], low, high)
+        powers = scales_of_orders(self._durations.take(segments)[:, None, None, None], low, high)
         return (out * powers).reshape(segments.size, -1, out.shape[3])
 
     _rows = WaypointSpline._rows  # `_sample` calls it

@@ -307,7 +307,7 @@ def _sample_grouped(
 def place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
     """Replace the lowest derivatives at some times by those that are known, (ntimes, k, naxes)."""
     rows, place = known.transpose(1, 2, 0), out[: known.shape[1]]
-    place[:, :, where] = np.where(np.isnan(rows), place[:, :, where], rows) if np.isnan(known).any() else rows
+    place[:, :, where] = rows if are_finite(known) else np.where(np.isnan(rows), place[:, :, where], rows)
 
 
 def in_products(coefficients: Array) -> Array:
@@ -398,6 +398,9 @@ def _evaluate_one(rows: Array, t: Array, duration: float, out: Array, alpha: flo
 
 def _multiply(rows: Array, functions: Array, out: Array) -> None:
     """Matrix products (..., nrows, ntime), each in one thread."""
+    if rows.shape[-2] * rows.shape[-1] * out.shape[-1] <= _PRODUCT:
+        np.matmul(rows, functions, out=out)
+        return
     step = max(1, _PRODUCT // (rows.shape[-2] * rows.shape[-1]))
     for begin in range(0, out.shape[-1], step):
         part = slice(begin, begin + step)
