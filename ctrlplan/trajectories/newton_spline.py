@@ -274,10 +274,13 @@ class NewtonSpline(WaypointSpline):
         given = point.jet[: order + 1]
         if len(given) > order and point.complete:
             return given
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0]
-        found[: len(given)] = np.where(np.isnan(given), found[: len(given)], given)
-        return found
+        known, key = self._end_jets, (segment, s, order)
+        if key not in known:
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0]
+            found[: len(given)] = np.where(np.isnan(given), found[: len(given)], given)
+            known[key] = readonly(found)
+        return known[key]
 
     def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
         """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""

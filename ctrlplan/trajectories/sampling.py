@@ -48,7 +48,7 @@ FEW = 256
 _CELLS = 30_000
 """Number of sorted times from which cells are faster than an interpolant with many terms."""
 
-_MANY = 300_000
+_MANY = 80_000
 """Number of sorted times from which cells are faster than an interpolant with few terms."""
 
 _SHORT = 24
@@ -506,7 +506,8 @@ def _sample_cells(
     low, high = orders
     if not t[-1] > t[0] or abs(math.log10(duration)) * (high + _MAX_TERMS) > _EXTREME:
         return None
-    size = np.abs(jet(np.linspace(0.0, duration, 9), high + _MAX_TERMS + 2)).max(axis=2)
+    some = duration * np.linspace(1e-6, 1.0 - 1e-6, 9)  # not at the ends, where the entries would be placed
+    size = np.abs(jet(some, high + _MAX_TERMS + 2)).max(axis=2)
     for cell in _CELL_SIZES:
         first, last = t[::cell], np.append(t[cell - 1 :: cell], t[-1])[: -(-t.size // cell)]
         radius = 0.625 * float(t[-1] - t[0]) / first.size  # some are longer than the mean
