@@ -55,6 +55,17 @@ def derivative_scale(duration: float, order: int) -> Array:
     return scale
 
 
+def scales_of_orders(duration: float | Array, low: int, high: int) -> Array:
+    """Factors (..., norders, 1, 1) from Taylor coefficients in normalised time to derivatives low to high."""
+    return FACTORIALS[low : high + 1, None, None] * duration ** _exponents(low, high)
+
+
+@lru_cache(maxsize=128)
+def _exponents(low: int, high: int) -> Array:
+    """Exponents (norders, 1, 1) of durations in derivatives."""
+    return readonly(-np.arange(low, high + 1.0)[:, None, None])
+
+
 _TINY = float(np.finfo(float).tiny)
 
 

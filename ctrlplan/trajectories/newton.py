@@ -383,15 +383,13 @@ class NewtonSystem(Fields):
     def taylor_between(self, u: Array, order: int) -> Array:
         r"""As `taylor`, faster at few times, none of which is a node.
 
-        A product of N factors q(u + h - x_i), or c, is its value at h = 0 times
+        A factor f with f'' = -2 w f, where w = alpha^2/8, has the series
 
-        .. math::
-            \sum_k e_k S(h)^k C(h)^{N-k}, \quad
-            S(h) = \tfrac{2}{\alpha}\sin\tfrac{\alpha h}{2}, \quad C(h) = \cos\tfrac{\alpha h}{2}
+        .. math:: f(u + h)/f(u) = 1 + r h - w h^2 - \tfrac{1}{3} w r h^3 + \dots, \quad r = f'/f
 
-        with the elementary symmetric sums e_k of the ratios f'/f of the factors,
-        which are accumulated for all functions together. Near a node a ratio is
-        large and the product small: errors are those of rounding of their product.
+        and those of all products of factors are accumulated together. Near a node a
+        ratio r is large and the product small: errors are those of rounding of their
+        product.
 
         Returns
         -------
@@ -401,46 +399,67 @@ class NewtonSystem(Fields):
         if order > _ELEMENTARY:
             return self.taylor(u, order).transpose(1, 0, 2)
         apart = u - self._nodes[:count, None]
-        if not apart.all():
+        if np.count_nonzero(apart) < apart.size:
             return self.taylor(u, order).transpose(1, 0, 2)
         out = np.zeros((order + 1, count + 1, u.size))
-        value = out[0]
+        value, bend = out[0], 0.5 * half * half
         value[0] = 1.0
         if half:
             apart *= half
-            sine, cosine = np.sin(apart), np.cos(apart)
-            apart, ratio = sine / half, half * cosine / sine
+            cosine = np.cos(apart)
+            apart = np.sin(apart, out=apart)
+            apart /= half
+            ratio = cosine / apart
         else:
             ratio = 1.0 / apart
         np.multiply.accumulate(apart, axis=0, out=value[1:])
-        terms = ratio
         for k in range(1, order + 1):
-            np.add.accumulate(terms, axis=0, out=out[k, 1:])
-            if k < order:
-                terms = ratio * out[k, :-1]
+            np.add.accumulate(_next(ratio, out[:k, :-1], bend), axis=0, out=out[k, 1:])
         if half:
-            _change_to_cosines(out, cosine[1::2], ratio[1::2], half)
-        out[1:] *= value
+            odd = list(out[:, 1::2])  # views; the last factor is a cosine, whose ratio is -2w/r
+            own = (-2.0 * bend) / ratio[1::2]
+            for k in range(order, 0, -1):
+                odd[k] += _next(own, odd[:k], bend)
+            odd[0] *= cosine[1::2]
+        derivatives = out[1:]
+        derivatives *= value
         if self._fold:
             out[:, self.size - 1] += self._fold * out[:, self.size]
         return out[:, : self.size]
 
-    def interpolant(self, low: int, high: int) -> Array:
-        """Interpolants (high - low + 1, size, nterms) of derivatives of the basis on the unit interval.
+    def interpolant(self, coefficients: Array, low: int, high: int) -> Array:
+        """Interpolants (high - low + 1, naxes, nterms) of Taylor coefficients on the unit interval.
 
         By the products of `sampling`, whose span contains the functions and their derivatives.
+
+        Parameters
+        ----------
+        coefficients : ndarray, shape (naxes, size)
+            Of the functions of the basis.
+        low, high : int
+            Lowest and highest order.
         """
+        points, products = collocation(effective(self.alpha), self.size)
+        if high not in self._values:
+            self._values[high] = readonly(self.taylor_between(points, high))
+        values = coefficients @ self._values[high][low:]
+        found = values.reshape(-1, points.size) @ products  # one product of matrices
+        return np.asarray(found.reshape(len(values), len(coefficients), -1))
+
+    def interpolants(self, low: int, high: int) -> Array:
+        """Interpolants (high - low + 1, size, nterms) of all functions of the basis, which are stored."""
         if (low, high) not in self._interpolants:
-            points, products = collocation(effective(self.alpha), self.size)
-            values = self.taylor_between(points, high)
-            for order in range(2, high + 1):
-                values[order] *= math.factorial(order)
-            self._interpolants[low, high] = readonly(values[low:] @ products)
+            self._interpolants[low, high] = readonly(self.interpolant(_identity(self.size), low, high))
         return self._interpolants[low, high]
 
     @cached_property
+    def _values(self) -> dict[int, Array]:
+        """Taylor coefficients at the points of interpolants by highest order."""
+        return {}
+
+    @cached_property
     def _interpolants(self) -> dict[tuple[int, int], Array]:
-        """Interpolants by lowest and highest order."""
+        """Interpolants of the basis by lowest and highest order."""
         return {}
 
     def series(self, coefficients: Array, u: Value, order: int) -> list[list[Value]]:
@@ -623,43 +642,22 @@ def _products_at_nodes(beyond: Array, apart: Array, places: NDArray[np.intp], or
     return np.asarray(sums.ravel().take(places).T)
 
 
-def _change_to_cosines(sums: Array, cosine: Array, ratio: Array, half: float) -> None:
-    """Include the cosine of each odd function in its value and sums, and the powers of cosines in all sums.
-
-    Parameters
-    ----------
-    sums : ndarray, shape (order + 1, size, ntime)
-        Value of each product, and its elementary symmetric sums.
-    cosine, ratio : ndarray, shape (npairs, ntime)
-        Cosine of each odd function, and the ratio f'/f of the sine of the same angle.
-    half : float
-        Half of alpha [rad].
-    """
-    order, square = len(sums) - 1, half * half
-    odd = sums[:, 1::2]
-    own = -square / ratio
-    for k in range(order, 1, -1):
-        odd[k] += own * odd[k - 1]
-    if order:
-        odd[1] += own
-    odd[0] *= cosine
-    if order > 1:
-        factors = _factors(sums.shape[1])
-        sums[2] -= (0.5 * square) * factors
-        if order > 2:
-            sums[3] -= (square / 6.0) * (3.0 * factors - 2.0) * sums[1]
+def _next(ratio: Array, lower: Array | Sequence[Array], bend: float) -> Array:
+    """Change by one factor of the coefficient after the lower ones; the first, the value, is taken for 1."""
+    order = len(lower)
+    if order == 1:
+        return ratio
+    found: Array = ratio * lower[-1]
+    if bend and order == 2:
+        found -= bend
+    elif bend:
+        found -= bend * lower[1] + (bend / 3.0) * ratio
+    return found
 
 
 @lru_cache(maxsize=128)
 def _identity(size: int) -> Array:
     return readonly(np.asfortranarray(np.eye(size)))
-
-
-@lru_cache(maxsize=256)
-def _factors(count: int) -> Array:
-    """Number of factors of each function, (count, 1)."""
-    number = np.arange(float(count))
-    return readonly((number + number % 2.0)[:, None])
 
 
 @lru_cache(maxsize=256)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.common import Array, are_finite, derivative_scale, mapped_time, readonly
+from ctrlplan.trajectories.common import Array, are_finite, derivative_scale, mapped_time, readonly, scales_of_orders
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, shared_system
 from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
@@ -260,14 +260,13 @@ class NewtonSpline(WaypointSpline):
         return out
 
     def _new_interpolant(self, segment: int, low: int, high: int) -> Interpolant | None:
-        found = [(axes, coefficients.T @ system.interpolant(low, high)) for axes, system, coefficients in self._parts]
+        found = [(axes, system.interpolant(coefficients.T, low, high)) for axes, system, coefficients in self._parts]
         rows = found[0][1]
         if len(found) > 1:
             rows = np.zeros((high - low + 1, self.naxes, max([own.shape[2] for _, own in found])))
             for axes, own in found:
                 rows[:, list(axes), : own.shape[2]] = own
-        powers = np.array([[[self._duration**-k]] for k in range(low, high + 1)])
-        return Interpolant.of(rows * powers, effective(self.alpha))
+        return Interpolant.of(rows * scales_of_orders(self._duration, low, high), effective(self.alpha))
 
     def _end_jet(self, segment: int, s: float, order: int) -> Array:
         # What a waypoint prescribes is not computed.
@@ -275,10 +274,13 @@ class NewtonSpline(WaypointSpline):
         given = point.jet[: order + 1]
         if len(given) > order and point.complete:
             return given
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0]
-        found[: len(given)] = np.where(np.isnan(given), found[: len(given)], given)
-        return found
+        known, key = self._end_jets, (segment, s, order)
+        if key not in known:
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0]
+            found[: len(given)] = np.where(np.isnan(given), found[: len(given)], given)
+            known[key] = readonly(found)
+        return known[key]
 
     def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
         """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""

@@ -103,11 +103,11 @@ class Pieces(Fields):
         return run.system.series_at(run.coefficients[:, :, segment - run.first].T.tolist(), u, order)
 
     def rows(self, segments: NDArray[np.intp], low: int, high: int) -> Array:
-        """Coefficients (nsegments, high - low + 1, naxes, nterms) of interpolants by relative time.
+        """Interpolants (nsegments, high - low + 1, naxes, nterms) of Taylor coefficients by the relative time.
 
         Numbers of segments must increase.
         """
-        found = [(run, run.system.interpolant(low, high)) for run in self.runs]
+        found = [(run, run.system.interpolants(low, high)) for run in self.runs]
         if len(found) == 1:
             return _rows(*found[0], segments)
         out = np.zeros((segments.size, high - low + 1, len(self.axes), max(basis.shape[2] for _, basis in found)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Literal, Self
 
 import numpy as np
@@ -15,7 +15,7 @@ from ctrlplan._display import number
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.chosen import checked_alpha, chosen_alpha
-from ctrlplan.trajectories.common import Array, are_finite, derivative_scale, mapped_time, readonly
+from ctrlplan.trajectories.common import Array, are_finite, derivative_scale, mapped_time, readonly, scales_of_orders
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
@@ -23,7 +23,7 @@ from ctrlplan.trajectories.pieces import Pieces, Run, scales
 from ctrlplan.trajectories.piecewise_extrema import Polynomials, stationary_places
 from ctrlplan.trajectories.piecewise_fit import Frame
 from ctrlplan.trajectories.polynomial import PolySpline
-from ctrlplan.trajectories.sampling import FEW, place_entries, sample_segments
+from ctrlplan.trajectories.sampling import FEW, Extent, place_entries, sample_segments
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
 from ctrlplan.trajectories.waypoint import Entries, Waypoint
@@ -445,7 +445,8 @@ class PiecewiseSpline(WaypointSpline):
     def _exponent(self) -> float:
         """Maximum magnitude of the decimal exponents of the durations."""
         durations = self._durations
-        return max(abs(math.log10(durations.min())), abs(math.log10(durations.max())))
+        shortest, longest = durations.item(durations.argmin()), durations.item(durations.argmax())
+        return max(abs(math.log10(shortest)), abs(math.log10(longest)))
 
     def _jets(self, segments: NDArray[np.intp], s: Array, low: int, high: int) -> Array:
         """Derivatives low to high, each time in its own segment."""
@@ -476,8 +477,8 @@ class PiecewiseSpline(WaypointSpline):
         if self._is_extreme(high) or not t.size:
             return super()._sample(t, low, high, left)
         times = self.breakpoints
-        is_sorted = bool((t[1:] >= t[:-1]).all())
-        first, last = (t.item(0), t.item(-1)) if is_sorted else (float(t.min()), float(t.max()))
+        extent = Extent.of(t)
+        first, last = extent.first, extent.last
         if not (first > times[0] if left else first >= times[0]) or not last <= times[-1]:
             inside = (t > times[0] if left else t >= times[0]) & (t <= times[-1])
             if np.count_nonzero(inside) <= _FEW:
@@ -487,7 +488,7 @@ class PiecewiseSpline(WaypointSpline):
             out[:, :, ~inside] = super()._sample(t[~inside], low, high, left)
             return out
         with np.errstate(over="ignore", invalid="ignore"):
-            out, finite = self._sample_inside(t, is_sorted, low, high, left)
+            out, finite = self._sample_inside(t, extent.is_sorted, low, high, left)
         return out if finite or np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
     def _sample_inside(self, t: Array, is_sorted: bool, low: int, high: int, left: bool) -> tuple[Array, bool]:
@@ -531,7 +532,7 @@ class PiecewiseSpline(WaypointSpline):
             out = np.zeros((segments.size, high - low + 1, self.naxes, max(rows.shape[3] for rows in found)))
             for pieces, rows in zip(self._pieces, found, strict=True):
                 out[:, :, list(pieces.axes), : rows.shape[3]] = rows
-        powers = self._durations[segments, None, None, None] ** _exponents(low, high)
+        powers = scales_of_orders(self._durations.take(segments)[:, None, None, None], low, high)
         return (out * powers).reshape(segments.size, -1, out.shape[3])
 
     _rows = WaypointSpline._rows  # `_sample` calls it
@@ -593,12 +594,6 @@ class PiecewiseSpline(WaypointSpline):
     def _facts(self) -> list[tuple[str, str]]:
         alpha = ("alpha", f"{number(self.alpha)} rad" if self.alpha else "")
         return [*super()._facts(), alpha, ("period", "" if self._period is None else f"{number(self._period)} s")]
-
-
-@lru_cache(maxsize=128)
-def _exponents(low: int, high: int) -> Array:
-    """Exponents (norders, 1, 1) of durations in derivatives."""
-    return readonly(-np.arange(low, high + 1.0)[:, None, None])
 
 
 def _range(run: Run, segments: slice | NDArray[np.intp]) -> tuple[Array, Array]:

@@ -14,24 +14,22 @@ coefficients of the other.
 Trigonometric polynomials of degree m on an arc of alpha radians have the same form,
 exactly and with 2m + 1 functions: with the angle w from the middle of the arc,
 
-.. math:: x = 2\,\frac{\sin(w/2)}{\sin(\alpha/4)}, \qquad V_{2k}(x), \quad \cos(w/2)\,V_{2k+1}(x)
+.. math:: x = 2\,\frac{\sin(w/2)}{\sin(\alpha/4)}, \qquad V_{2k}(x), \quad \sin w\,\frac{V_{2k+1}(x)}{x}
 
 as even ones are polynomials in cos w, and odd ones are sin w times those. These
-functions are well conditioned for every alpha; at alpha = 0 they are Chebyshev's.
+functions are well conditioned for every alpha.
 
-Very many sorted times are divided into cells. In each cell the Taylor series about
-its centre, from the exact jet there, gives the values: by one matrix product for all
-cells if the times are evenly spaced, otherwise by one per cell. All are as accurate
-as the jets: series are truncated below rounding.
+Very many sorted times are divided into cells of as many times each. In each cell
+the Taylor series about its centre gives the values, by few terms: the interpolants
+are evaluated at the centres only. The powers are the same in all cells if the times
+are evenly spaced. All are as accurate as the jets: series are truncated below
+rounding.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from enum import Enum, auto
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -50,7 +48,7 @@ FEW = 256
 _CELLS = 30_000
 """Number of sorted times from which cells are faster than an interpolant with many terms."""
 
-MANY = 300_000
+_MANY = 80_000
 """Number of sorted times from which cells are faster than an interpolant with few terms."""
 
 _SHORT = 24
@@ -61,11 +59,12 @@ _PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
 _CHUNK = 4104  # the functions stay in the second cache; no power of two, to avoid conflicts between rows
 _SPARSE = 48  # number of times per segment from which a matrix product for each segment is faster
 _COMPARED = 18  # number of breakpoints up to which comparisons with each are faster than searches
+_CELL_SIZES = 1024, 512, 256, 128, 64  # numbers of times per cell: the first with few terms is taken
+_EXTREME = 200.0  # decimal exponent of powers of a duration above which series are not evaluated
 _BLOCK = 16 * _CHUNK  # number of times that are grouped together
 
 
-@dataclass(frozen=True, eq=False)
-class Interpolant:
+class Interpolant(NamedTuple):
     """Interpolants of derivatives on one segment.
 
     Attributes
@@ -89,22 +88,31 @@ class Interpolant:
         return cls(readonly(rows), are_finite(rows), alpha)
 
 
-class Arrangement(Enum):
-    """Order of times.
+class Extent(NamedTuple):
+    """What is known of many times of a segment.
 
-    Evenly spaced ones are so up to rounding, and increase strictly.
+    Attributes
+    ----------
+    first, last : float
+        Smallest and largest time [s]; nan if one is nan.
+    is_sorted : bool
+        Whether no time is below the one before.
     """
 
-    ANY = auto()
-    SORTED = auto()
-    EVEN = auto()
+    first: float
+    last: float
+    is_sorted: bool
 
     @classmethod
-    def of(cls, t: Array, duration: float) -> Arrangement:
-        """Arrangement of times of a segment with a duration."""
-        if _is_uniform(t, duration):
-            return cls.EVEN
-        return cls.SORTED if t[-1] > t[0] and _is_sorted(t) else cls.ANY
+    def of(cls, t: Array) -> Extent:
+        """Extent of one or more times."""
+        if _is_sorted(t):
+            return cls(t.item(0), t.item(-1), True)
+        return cls(t.item(t.argmin()), t.item(t.argmax()), False)
+
+    def since(self, start: float) -> Extent:
+        """Extent of the times since a start."""
+        return Extent(self.first - start, self.last - start, self.is_sorted)
 
 
 class Part(NamedTuple):
@@ -129,12 +137,12 @@ class Part(NamedTuple):
 
 def sample(
     jet: Callable[[Array, int], Array],
-    interpolant: Interpolant | None,
+    interpolants: Callable[[int, int], Interpolant | None],
     duration: float,
     t: Array,
     orders: tuple[int, int],
     out: Array,
-    arrangement: Arrangement | None = None,
+    extent: Extent,
 ) -> bool:
     """Derivatives at many times; whether they are certainly finite.
 
@@ -142,8 +150,8 @@ def sample(
     ----------
     jet : callable
         Maps times (ntime,) and an order to (order + 1, naxes, ntime).
-    interpolant : Interpolant or None
-        Of these derivatives; None if they are not resolved.
+    interpolants : callable
+        Maps a lowest and a highest order to the `Interpolant` of these derivatives; None if they are not resolved.
     duration : float
         Length [s] of the segment, from 0, in which the function is analytic.
     t : ndarray, shape (ntime,)
@@ -152,18 +160,15 @@ def sample(
         Lowest and highest order of the derivatives.
     out : ndarray, shape (norders, naxes, ntime)
         Place of the result.
-    arrangement : Arrangement, optional
-        Of the times, if it is known.
+    extent : Extent
+        Of the times.
     """
-    if interpolant is None or t.size > (_CELLS if interpolant.rows.shape[1] > _SHORT else MANY):
-        finite = _sample_cells(jet, duration, t, orders, out, arrangement or Arrangement.of(t, duration))
+    interpolant = interpolants(*orders)
+    if extent.is_sorted and (interpolant is None or t.size > (_CELLS if interpolant.rows.shape[1] > _SHORT else _MANY)):
+        finite = _sample_cells(jet, interpolants, duration, t, orders, out)
         if finite is not None:
             return finite
-    if interpolant is None:
-        _sample_chunks(jet, t, orders, out)
-        return False
-    evaluate([Part(interpolant.rows, 0, t.size, 0.0, duration)], t, out, interpolant.alpha)
-    return interpolant.is_finite
+    return _sample_each(jet, interpolant, duration, t, orders, out)
 
 
 def sample_segments(
@@ -302,7 +307,7 @@ def _sample_grouped(
 def place_entries(known: Array, where: NDArray[np.intp], out: Array) -> None:
     """Replace the lowest derivatives at some times by those that are known, (ntimes, k, naxes)."""
     rows, place = known.transpose(1, 2, 0), out[: known.shape[1]]
-    place[:, :, where] = np.where(np.isnan(rows), place[:, :, where], rows) if np.isnan(known).any() else rows
+    place[:, :, where] = rows if are_finite(known) else np.where(np.isnan(rows), place[:, :, where], rows)
 
 
 def in_products(coefficients: Array) -> Array:
@@ -341,6 +346,7 @@ def collocation(alpha: float, size: int) -> Collocation:
     angles = np.arcsin(math.sin(0.25 * alpha) * nodes)  # half of those from the middle
     weights = 1.0 / np.cos(angles)[:, None]  # odd functions are divided by the cosine, which leaves polynomials
     products = 0.5 * (products + products[::-1] + weights * products - weights * products[::-1])
+    products[:, 1::2] *= 1.0 / math.sin(0.25 * alpha)  # x cos(w/2) is sin w over that
     return Collocation(readonly(0.5 + (2.0 / alpha) * angles), readonly(products))
 
 
@@ -375,10 +381,30 @@ def evaluate(parts: Sequence[Part], t: Array, out: Array, alpha: float = 0.0) ->
             place += 1
         _fill(functions, alpha)
         for rows, first, last in inside:
-            step = max(1, _PRODUCT // rows.size)
-            for low in range(first, last, step):
-                high = min(low + step, last)
-                np.matmul(rows, functions[: rows.shape[1], low - begin : high - begin], out=target[:, low:high])
+            _multiply(rows, functions[: rows.shape[1], first - begin : last - begin], target[:, first:last])
+
+
+def _evaluate_one(rows: Array, t: Array, duration: float, out: Array, alpha: float) -> None:
+    """As `evaluate`, at times since the start of one segment."""
+    target = out.reshape(-1, t.size)  # a view
+    basis = _new_basis(rows.shape[1], t.size, alpha)
+    for begin in range(0, t.size, _CHUNK):
+        part = t[begin : begin + _CHUNK]
+        functions = basis[:, : part.size]
+        _scale(part, 0.0, duration, alpha, functions[1])
+        _fill(functions, alpha)
+        _multiply(rows, functions[: rows.shape[1]], target[:, begin : begin + part.size])
+
+
+def _multiply(rows: Array, functions: Array, out: Array) -> None:
+    """Matrix products (..., nrows, ntime), each in one thread."""
+    if rows.shape[-2] * rows.shape[-1] * out.shape[-1] <= _PRODUCT:
+        np.matmul(rows, functions, out=out)
+        return
+    step = max(1, _PRODUCT // (rows.shape[-2] * rows.shape[-1]))
+    for begin in range(0, out.shape[-1], step):
+        part = slice(begin, begin + step)
+        np.matmul(rows, functions[..., part], out=out[..., part])
 
 
 def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Array, out: Array, alpha: float) -> None:
@@ -403,48 +429,51 @@ def _evaluate_each(rows: Array, index: NDArray[np.intp], t: Array, duration: Arr
 
 
 def _new_basis(size: int, ntime: int, alpha: float) -> Array:
-    """Memory for the functions at some times, with a row more for the cosines."""
-    basis = np.empty((max(size, 2) + (alpha > 0.0), min(_CHUNK, ntime)))
+    """Memory for the functions at some times."""
+    basis = np.empty((max(size, 4 if alpha else 2), min(_CHUNK, ntime)))
     basis[0] = 1.0
     return basis
 
 
 def _scale(t: Array, start: float, duration: Array | float, alpha: float, out: Array) -> None:
-    """Replace by times relative to the middle of their segments, from -2 to 2, or by a quarter of the angle."""
+    """Replace by times relative to the middle of their segments, from -2 to 2, or by half of the angle."""
     if start:
         t = np.subtract(t, start, out)
     np.subtract(t, 0.5 * duration, out)
-    np.divide(out, 4.0 * duration / alpha if alpha else 0.25 * duration, out)
+    np.divide(out, 2.0 * duration / alpha if alpha else 0.25 * duration, out)
 
 
 def _fill(functions: Array, alpha: float) -> None:
     """Fill the basis (size, ntime) from its first two functions, 1 and the scaled time."""
-    top, size = 1, len(functions) - (alpha > 0.0)
+    top, size = 1, len(functions)
     if alpha:
-        _change_to_sines(functions[1], functions[size], alpha)
+        _change_to_sines(functions, alpha)
+        top = 2
     while 2 * top < size:
         square = functions[2 * top]
         np.multiply(functions[top], functions[top], out=square)
         square -= 2.0
-        if alpha and top == 1:
-            functions[1] *= functions[size]
         more = min(2 * top, size - 2 * top)
         np.multiply(functions[1:more], square, out=functions[2 * top + 1 : 2 * top + more])
         top *= 2
 
 
-def _change_to_sines(angle: Array, cosine: Array, alpha: float) -> None:
-    """Replace a quarter of the angle by the scaled sine of half of it, and set the cosine of that.
+def _change_to_sines(functions: Array, alpha: float) -> None:
+    """Replace half of the angle by the sine of the angle, and set the next two functions.
 
-    Both follow from the tangent, whose evaluation is faster than that of a sine and as accurate.
+    They follow from the tangent of the half, whose evaluation is faster than that of a sine and as accurate:
+    sin w = 2z/(1 + z^2) and x^2 = 2 z sin w / sin(alpha/4)^2.
     """
-    np.tan(angle, out=angle)
-    np.multiply(angle, angle, out=cosine)
-    cosine += 1.0
-    np.divide(2.0, cosine, out=cosine)
-    angle *= cosine
-    angle *= 2.0 / math.sin(0.25 * alpha)
-    cosine -= 1.0
+    _, sine, second, tangent = functions[:4]
+    np.tan(sine, out=tangent)
+    np.multiply(tangent, tangent, out=second)
+    second += 1.0
+    np.divide(2.0, second, out=second)
+    np.multiply(tangent, second, out=sine)
+    np.multiply(tangent, sine, out=second)
+    second *= 2.0 / math.sin(0.25 * alpha) ** 2
+    second -= 2.0
+    np.multiply(sine, second, out=tangent)
 
 
 @lru_cache(maxsize=256)
@@ -464,30 +493,111 @@ def _products_of_chebyshev(size: int) -> Array:
 
 def _sample_cells(
     jet: Callable[[Array, int], Array],
+    interpolants: Callable[[int, int], Interpolant | None],
     duration: float,
     t: Array,
     orders: tuple[int, int],
     out: Array,
-    arrangement: Arrangement,
 ) -> bool | None:
-    """As `sample`, at sorted times by Taylor series in cells; None if times are not sorted, or series too long."""
-    if arrangement is Arrangement.ANY:
-        return None
+    """As `sample`, at sorted times by Taylor series in cells; None if the series are too long.
+
+    The few cells that are longer than others, where times are far apart, are evaluated as other times.
+    """
     low, high = orders
-    size = np.abs(jet(np.linspace(0.0, duration, 9), high + _MAX_TERMS + 2)).max(axis=2)
-    if arrangement is Arrangement.EVEN:
-        step = float(t[-1] - t[0]) / (t.size - 1)
-        for cell in (2048, 1024, 512, 256, 128, 64):
-            terms = _taylor_terms(size, 0.5 * cell * step, low, high)
-            if terms is not None:
-                return _sample_uniform(jet, float(t[0]), step, cell, terms, low, out)
+    if not t[-1] > t[0] or abs(math.log10(duration)) * (high + _MAX_TERMS) > _EXTREME:
+        return None
+    some = duration * np.linspace(1e-6, 1.0 - 1e-6, 9)  # not at the ends, where the entries would be placed
+    size = np.abs(jet(some, high + _MAX_TERMS + 2)).max(axis=2)
+    for cell in _CELL_SIZES:
+        first, last = t[::cell], np.append(t[cell - 1 :: cell], t[-1])[: -(-t.size // cell)]
+        radius = 0.625 * float(t[-1] - t[0]) / first.size  # some are longer than the mean
+        terms = _taylor_terms(size, radius, low, high)
+        if terms is not None:
+            break
     else:
-        for cell in (4096, 2048, 1024, 512, 256):
-            ncells = -(-t.size // cell)
-            terms = _taylor_terms(size, 0.5 * float(t[-1] - t[0]) / ncells, low, high)
-            if terms is not None:
-                return _sample_sorted(jet, t, ncells, terms, low, out)
-    return None
+        return None
+    wide = (last - first > 2.0 * radius).nonzero()[0].tolist()
+    if len(wide) > max(1, first.size // 8):
+        return None
+    centres, exact = 0.5 * (first + last), (low, high + terms - 1)
+    derivatives = np.empty((exact[1] - low + 1, out.shape[1], centres.size))
+    interpolant = interpolants(*orders)
+    finite = _sample_each(jet, interpolant and interpolants(*exact), duration, centres, exact, derivatives)
+    _evaluate_series(_series(derivatives, terms), centres, t, cell, _is_uniform(t, duration), out)
+    for k in wide:
+        part = slice(k * cell, (k + 1) * cell)
+        finite &= _sample_each(jet, interpolant, duration, t[part], orders, out[:, :, part])
+    return finite and are_finite(_bounds(derivatives, radius, terms))
+
+
+def _sample_each(
+    jet: Callable[[Array, int], Array],
+    interpolant: Interpolant | None,
+    duration: float,
+    t: Array,
+    orders: tuple[int, int],
+    out: Array,
+) -> bool:
+    """As `sample`, by an interpolant, or by jets where there is none."""
+    if interpolant is None:
+        for begin in range(0, t.size, _CHUNK):
+            out[:, :, begin : begin + _CHUNK] = jet(t[begin : begin + _CHUNK], orders[1])[orders[0] :]
+        return False
+    _evaluate_one(interpolant.rows, t, duration, out, interpolant.alpha)
+    return interpolant.is_finite
+
+
+def _series(derivatives: Array, terms: int) -> Array:
+    """Taylor coefficients (ncells, norders * naxes, terms) from derivatives (norders + terms - 1, naxes, ncells)."""
+    norders = len(derivatives) - terms + 1
+    table = np.empty((derivatives.shape[2], norders, derivatives.shape[1], terms))
+    for k in range(terms):
+        np.divide(derivatives[k : k + norders].transpose(2, 0, 1), FACTORIALS[k], out=table[..., k])
+    return table.reshape(len(table), -1, terms)
+
+
+def _bounds(derivatives: Array, radius: float, terms: int) -> Array:
+    """Bounds of the sums of the magnitudes of all terms, for each order."""
+    powers = radius ** np.arange(terms) / FACTORIALS[:terms]
+    return np.convolve(np.abs(derivatives).max(axis=(1, 2)), powers[::-1], mode="valid")
+
+
+def _evaluate_series(table: Array, centres: Array, t: Array, cell: int, is_even: bool, out: Array) -> None:
+    """Values of Taylor series about the centre of each cell of consecutive times."""
+    terms, whole = table.shape[2], t.size // cell
+    together = 1 if is_even else max(1, 2 * _CHUNK // cell)
+    # The row of memory is longer than its times, to avoid conflicts between rows.
+    basis = np.empty((max(terms, 2), together * cell + 8))[:, :-8].reshape(-1, together, cell)
+    basis[0] = 1.0
+    flat = out.reshape(-1, t.size)  # a view
+    times = t[: whole * cell].reshape(whole, cell)
+    values = flat[:, : whole * cell].reshape(-1, whole, cell).transpose(1, 0, 2)
+    if whole < len(table):
+        _evaluate_cells(table[whole:], centres[whole:], t[None, whole * cell :], basis, flat[None, :, whole * cell :])
+    if is_even and whole:
+        powers = _powers(times[:1], centres[:1], basis)
+        _multiply(table[:whole], powers[:, :terms], values)
+        return
+    for begin in range(0, whole, together):
+        part = slice(begin, min(begin + together, whole))
+        _evaluate_cells(table[part], centres[part], times[part], basis, values[part])
+
+
+def _evaluate_cells(table: Array, centres: Array, t: Array, basis: Array, out: Array) -> None:
+    """Values (ncells, nrows, ntime) of series at times (ncells, ntime)."""
+    powers = _powers(t, centres, basis[:, : len(t), : t.shape[1]])
+    _multiply(table, powers[:, : table.shape[2]], out)
+
+
+def _powers(t: Array, centres: Array, out: Array) -> Array:
+    """Powers (ncells, size, ntime) of the distances of times (ncells, ntime) from the centres of cells."""
+    np.subtract(t, centres[:, None], out=out[1])
+    top, size = 1, len(out)
+    while top + 1 < size:  # x^(top + k) = x^top x^k doubles the number in each pass
+        more = min(top, size - 1 - top)
+        np.multiply(out[1 : more + 1], out[top], out=out[top + 1 : top + more + 1])
+        top += more
+    return out.transpose(1, 0, 2)
 
 
 def sample_in_batches(plan: Trajectory, t: Array, low: int, high: int, left: bool) -> Array:
@@ -515,26 +625,22 @@ def _is_uniform(t: Array, duration: float) -> bool:
     slack = 4.0 * np.finfo(float).eps * duration
     if not step > 2.0 * slack or abs(t[1] - t[0] - step) > slack:
         return False
-    ramp = step * np.arange(min(t.size, 2 * _CHUNK))
+    ramp = step * np.arange(min(t.size, 8 * _CHUNK))
     beyond = np.empty_like(ramp)
     for first in range(0, t.size, ramp.size):
         part = t[first : first + ramp.size]
         excess = np.subtract(part, ramp[: part.size], out=beyond[: part.size])
         base = t[0] + first * step
-        if not (excess.max() - base <= slack and base - excess.min() <= slack):
+        if not (np.maximum.reduce(excess) - base <= slack and base - np.minimum.reduce(excess) <= slack):
             return False
     return True
 
 
-def is_increasing(arrangement: Arrangement | None) -> bool:
-    """Whether times are known to be sorted."""
-    return arrangement in (Arrangement.SORTED, Arrangement.EVEN)
-
-
 def _is_sorted(t: Array) -> bool:
-    """Whether no time is below the one before; of times in any order the first ones say so."""
-    first = t[:FEW]
-    return bool((first[1:] >= first[:-1]).all()) and bool((t[1:] >= t[:-1]).all())
+    """Whether no time is below the one before; of times in any order a few say so."""
+    if not t.item(0) <= t.item(t.size // 2) <= t.item(-1):
+        return False
+    return (t.size <= _CHUNK or _is_sorted(t[:FEW])) and int(np.count_nonzero(t[1:] >= t[:-1])) == t.size - 1
 
 
 def _taylor_terms(size: Array, radius: float, low: int, high: int) -> int | None:
@@ -548,66 +654,3 @@ def _taylor_terms(size: Array, radius: float, low: int, high: int) -> int | None
     # Two terms in a row, so that an odd or even function does not end its series early.
     done = (small[:, 1:-1] & small[:, 2:]).all(axis=(0, 2))
     return int(done.argmax()) + 1 if done.any() else None
-
-
-def _sample_uniform(
-    jet: Callable[[Array, int], Array], first: float, step: float, cell: int, terms: int, low: int, out: Array
-) -> bool:
-    norders, naxes, count = out.shape
-    ncells = count // cell
-    centres = first + step * (0.5 * (cell - 1) + cell * np.arange(ncells + 1, dtype=float))
-    jets = jet(centres, low + norders + terms - 2)
-    radius = 0.5 * cell * step
-    powers = np.linspace(-1.0 + 1.0 / cell, 1.0 - 1.0 / cell, cell) ** np.arange(terms)[:, None]
-    scale = radius ** np.arange(terms) / FACTORIALS[:terms]
-    main = ncells * cell
-    block = max(1, _PRODUCT // (terms * cell))
-    finite = True
-    for row in range(norders):
-        table = np.ascontiguousarray(np.moveaxis(jets[low + row : low + row + terms], 0, -1) * scale)
-        finite &= are_finite(table)
-        for axis in range(naxes):
-            whole = out[row, axis, :main].reshape(ncells, cell)
-            for begin in range(0, ncells, block):
-                np.matmul(table[axis, begin : min(begin + block, ncells)], powers, out=whole[begin : begin + block])
-            if main < count:
-                np.matmul(table[axis, ncells], powers[:, : count - main], out=out[row, axis, main:])
-    return finite
-
-
-def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, terms: int, low: int, out: Array) -> bool:
-    norders, naxes, _ = out.shape
-    edges: Array = np.linspace(t[0], t[-1], ncells + 1)
-    centres, radius = 0.5 * (edges[:-1] + edges[1:]), 0.5 * float(t[-1] - t[0]) / ncells
-    jets = jet(centres, low + norders + terms - 2)
-    scale = radius ** np.arange(terms) / FACTORIALS[:terms]
-    table = np.stack([np.moveaxis(jets[nu : nu + terms], 0, -1) for nu in range(low, low + norders)]) * scale
-    table = np.moveaxis(table, 2, 0).reshape(ncells, -1, terms)
-    flat = out.reshape(norders * naxes, t.size)  # a view
-    bounds = [0, *np.searchsorted(t, edges[1:-1]).tolist(), t.size]
-    widest = max(1, min(_CHUNK, _PRODUCT // table[0].size))
-    basis = np.empty((max(terms, 2), widest))
-    basis[0] = 1.0
-    for k, (first, last) in enumerate(itertools.pairwise(bounds)):
-        for begin in range(first, last, widest):
-            end = min(begin + widest, last)
-            powers = basis[:, : end - begin]
-            np.subtract(t[begin:end], centres[k], out=powers[1])
-            powers[1] /= radius
-            _powers(powers)
-            np.matmul(table[k], powers[:terms], out=flat[:, begin:end])
-    return are_finite(table)
-
-
-def _powers(functions: Array) -> None:
-    """Powers (size, ntime) from the first two, 1 and x."""
-    top, size = 1, len(functions)
-    while top + 1 < size:  # x^(top + k) = x^top x^k doubles the number in each pass
-        more = min(top, size - 1 - top)
-        np.multiply(functions[1 : more + 1], functions[top], out=functions[top + 1 : top + more + 1])
-        top += more
-
-
-def _sample_chunks(jet: Callable[[Array, int], Array], t: Array, orders: tuple[int, int], out: Array) -> None:
-    for begin in range(0, t.size, _CHUNK):
-        out[:, :, begin : begin + _CHUNK] = jet(t[begin : begin + _CHUNK], orders[1])[orders[0] :]

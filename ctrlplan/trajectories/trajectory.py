@@ -1114,10 +1114,12 @@ class Trajectory(Displayed, Fields, ABC):
             return _sampling.sample_in_batches(self, t, low, high, left)
         moments, nsegments = self._moments, self.breakpoints.size - 1
         if nsegments == 1 and not left and t.size:
-            order = _sampling.Arrangement.of(t, moments[1] - moments[0]) if t.size > _sampling.MANY else None
-            first, last = _range(t, order)
-            if first >= moments[0] and last <= moments[1]:
-                return self._sample_segment(0, t - moments[0] if moments[0] else t, low, high, arrangement=order)
+            start, end = moments
+            extent = _sampling.Extent.of(t)
+            if extent.first >= start and extent.last <= end:
+                if start:
+                    t, extent = t - start, extent.since(start)
+                return self._sample_segment(0, t, low, high, extent=extent)
         segments = np.searchsorted(self.breakpoints, t, side="left" if left else "right") - 1
         if nsegments and not left:
             segments[t == self.breakpoints[-1]] = nsegments - 1
@@ -1148,7 +1150,7 @@ class Trajectory(Displayed, Fields, ABC):
         low: int,
         high: int,
         out: Array | None = None,
-        arrangement: _sampling.Arrangement | None = None,
+        extent: _sampling.Extent | None = None,
     ) -> Array:
         """Derivatives low to high of a segment, in a part of the result if it is given."""
         if abs(math.log10(self._length(segment))) * high > 200.0:
@@ -1159,15 +1161,13 @@ class Trajectory(Displayed, Fields, ABC):
                 finite = False
             else:
                 found = np.empty((high - low + 1, self.naxes, s.size)) if out is None else out
-                finite = self._sample_many(segment, s, low, found, arrangement)
+                finite = self._sample_many(segment, s, low, found, extent)
             suspect = not finite and not np.isfinite(found.sum())
         if suspect:
             self._check_finite(found, segment, high)
         return found
 
-    def _sample_many(
-        self, segment: int, s: Array, low: int, out: Array, arrangement: _sampling.Arrangement | None
-    ) -> bool:
+    def _sample_many(self, segment: int, s: Array, low: int, out: Array, extent: _sampling.Extent | None) -> bool:
         """Derivatives from an order on, as many as `out` has rows, at many times of a segment.
 
         Whether they are certainly finite is returned.
@@ -1176,22 +1176,27 @@ class Trajectory(Displayed, Fields, ABC):
         def jet(u: Array, order: int) -> Array:
             return self.segment_jet(segment, u, order)
 
-        orders = low, low + len(out) - 1
-        interpolant, length = self._interpolant(segment, *orders), self._length(segment)
-        finite = _sampling.sample(jet, interpolant, length, s, orders, out, arrangement)
-        self._place_ends(segment, s, low, out, _sampling.is_increasing(arrangement))
+        def interpolants(lowest: int, highest: int) -> _sampling.Interpolant | None:
+            return self._interpolant(segment, lowest, highest)
+
+        duration = self._length(segment)
+        known = extent or _sampling.Extent.of(s)
+        finite = _sampling.sample(jet, interpolants, duration, s, (low, low + len(out) - 1), out, known)
+        self._place_ends(segment, s, low, out, known)
         return finite
 
-    def _place_ends(self, segment: int, s: Array, low: int, out: Array, is_sorted: bool = False) -> None:
+    def _place_ends(self, segment: int, s: Array, low: int, out: Array, extent: _sampling.Extent | None = None) -> None:
         """Replace derivatives at the ends of a segment: they are the entries of waypoints in every bit."""
         for end in (0.0, self._length(segment)):
-            if is_sorted:
-                where = np.arange(s.searchsorted(end, side="left"), s.searchsorted(end, side="right"))
+            if extent and not extent.first <= end <= extent.last:
+                continue
+            if extent and extent.is_sorted and s.item(-2 if end else 1) != end:  # only the outermost one
+                where = [s.size - 1 if end else 0]
             else:
-                where = (s == end).nonzero()[0]
-            if where.size == 1:
-                out[:, :, where.item()] = self._end_jet(segment, end, low + len(out) - 1)[low:]
-            elif where.size:
+                where = (s == end).nonzero()[0].tolist()
+            if len(where) == 1:
+                out[:, :, where[0]] = self._end_jet(segment, end, low + len(out) - 1)[low:]
+            elif where:
                 out[:, :, where] = self._end_jet(segment, end, low + len(out) - 1)[low:, :, None]
 
     def _length(self, segment: int) -> float:
@@ -1318,13 +1323,6 @@ def check_end(plan: Trajectory, name: str = "plan") -> None:
             f"{name} must have an end, got a plan that repeats for all future times; use the part that repeats (its "
             "attribute `plan`), or a number of repetitions of it by `repeat`"
         )
-
-
-def _range(t: Array, arrangement: _sampling.Arrangement | None) -> tuple[float, float]:
-    """Minimum and maximum of times, nan if one is nan."""
-    if _sampling.is_increasing(arrangement):
-        return t.item(0), t.item(-1)
-    return float(t.min()), float(t.max())
 
 
 def _placed(values: Array, out: Array | None) -> Array:

@@ -159,6 +159,39 @@ def test_against_fifty_digits():
         assert (np.abs(plan.jet(t, 2)[:, 0, some] - exact) / size).max() <= 2e-13
 
 
+@pytest.mark.parametrize("alpha", [0.0, 3.0])
+def test_very_many_times_against_fifty_digits(alpha):
+    """Taylor series in cells: the third derivative too, the last cell short, one cell across a gap."""
+    times, jets = [0.0, 0.3, 1.0], [[0.0, 1.0, 2.0], [1.0, -1.0], [0.5, 0.0, 3.0]]
+    plan, oracle = TrigSpline(waypoints(times, jets), alpha=alpha), Direct(times, jets, alpha)
+    rng, count = np.random.default_rng(7), 300_500
+    given = orders_of(plan, count, rng)
+    inside = given["arbitrary"]
+    given["with a gap"] = np.sort(np.where(inside > 0.5, 0.9 + 0.1 * inside, 0.2 * inside))
+    given["dense at one end"] = np.sort(inside**3)
+    for name, t in given.items():
+        found = plan.jet(t, 3)[:, 0]
+        gap = int(np.diff(t).argmax()) if name != "arbitrary" else 0
+        some = np.unique(np.r_[0 : count : count // 17, gap : gap + 2, count - 500 : count : 100, count - 1])
+        exact = oracle.jet(t[some], 3)
+        size = np.abs(found).max(axis=1, keepdims=True)
+        assert (np.abs(found[:, some] - exact) / size).max() <= 2e-14, name
+
+
+@pytest.mark.parametrize("count", [300_001, 301_056, 302_000])
+def test_cells_of_sorted_times_agree_with_the_jets(count):
+    """Whole cells only, and a last cell of few times; equal times; times that are close together."""
+    plan = random_plan(12, 1.0, naxes=2)
+    rng = np.random.default_rng(5)
+    for name, t in orders_of(plan, count, rng).items():
+        assert disagreement(plan, t, order=3) <= 1, name
+    a, b = plan.start + plan.duration * np.array([0.3, 0.30001])
+    t = np.sort(rng.uniform(a, b, count))
+    assert disagreement(plan, t) <= 1
+    t[1000:9000] = t[1000]
+    assert disagreement(plan, t) <= 1
+
+
 def test_times_that_are_all_the_same():
     plan = random_plan(12, 2.0)
     t = np.full(5000, plan.start + 0.3)
@@ -364,6 +397,35 @@ def test_ends_have_the_entries_of_waypoints_in_every_bit(kind):
         nearby = plan.jet(end + (1e-9 if k == 0 else -1e-9), 2)
         slack = 1e-12 * np.abs(plan.jet(t, 2)).max(axis=2) + 2e-9 * np.abs(plan.jet(t, 3)[1:]).max(axis=2)
         assert (np.abs(plan.jet(end, 2) - nearby) <= slack).all()
+
+
+@pytest.mark.parametrize("kind", ENDS)
+@pytest.mark.parametrize("count", [300, 2000])
+def test_ends_among_many_times_in_any_order(kind, count):
+    """Once, many times or never, sorted or not: the entries there in every bit, and other values elsewhere."""
+    rng = np.random.default_rng(14)
+    jets = rng.normal(size=(3, 3, 2))
+    for marks in ([0.3, 1.0, 2.1], [0.0, 1.0, 2.1]):
+        plan = ENDS[kind]([Waypoint(t, *jet) for t, jet in zip(marks, jets, strict=True)])
+        inside = rng.uniform(*plan.breakpoints[[0, -1]], count)
+        begin, end = np.full(count // 3, plan.start), np.full(count // 4, plan.end)
+        given = {
+            "both once": np.r_[plan.start, np.sort(inside), plan.end],
+            "both many times": np.r_[begin, np.sort(inside), end],
+            "start only": np.r_[plan.start, np.sort(inside)],
+            "end only": np.r_[np.sort(inside), end],
+            "neither": inside,
+            "mixed": rng.permutation(np.r_[begin, inside, end]),
+            "one inside": np.r_[inside, plan.end, inside],
+            "descending": np.sort(np.r_[plan.start, inside, plan.end])[::-1],
+            "only starts": begin if begin.size > 256 else np.repeat(begin, 3),
+        }
+        for name, t in given.items():
+            found = plan.jet(t, 2)
+            for moment, jet in ((plan.start, jets[0]), (plan.end, jets[2])):
+                assert (found[:, :, t == moment] == jet[:, :, None]).all(), name
+            few = np.concatenate([plan.jet(part, 2) for part in np.array_split(t, 10)], axis=2)
+            assert (np.abs(found - few) <= 1e-12 * np.abs(few).max(axis=2, keepdims=True)).all(), name
 
 
 def times_of_segments(plan, count, rng):
