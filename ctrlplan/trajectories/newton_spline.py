@@ -20,7 +20,7 @@ from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, shared_sys
 from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
 from ctrlplan.trajectories.sampling import Interpolant
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing, within
-from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.waypoint import Waypoint, joined
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
 
 _SHARED = 24
@@ -141,7 +141,7 @@ class NewtonSpline(WaypointSpline):
                 size = _size(alpha, sum(map(len, given)), options.degree)
                 system = _system(alpha, relative, apart, kind, size, options.smooth)
             systems[kind] = system
-            data = table[system.waypoint_index, system.order_index]
+            data = system.entries(table)
             if len(axes) < table.shape[2]:
                 data = data[:, axes]
             parts.append((axes, system, _solved(system, data, times, duration)))
@@ -151,7 +151,7 @@ class NewtonSpline(WaypointSpline):
             labels = checked_labels(options.labels or waypoints[0].labels, table.shape[2])
         moments = [start, times[-1] if period is None else start + period]
         breakpoints = donor.breakpoints if donor is not None and same_times else readonly(np.array(moments))
-        self._set_fields(
+        self._fill(
             waypoints=waypoints,
             alpha=alpha,
             labels=labels,
@@ -207,7 +207,7 @@ class NewtonSpline(WaypointSpline):
         """
         parts = []
         for axes, system, coefficients in self._parts:
-            values = table[system.waypoint_index, system.order_index][:, list(axes)]
+            values = system.entries(table)[:, list(axes)]
             if system.hermite:
                 coefficients = system.resolved(values, self._times, self._duration, digits)
             parts.append((axes, system, coefficients))
@@ -349,7 +349,7 @@ def _solved(system: NewtonSystem, data: Array, times: list[float], duration: flo
     """Coefficients from prescribed derivatives (nconstraints, naxes)."""
     with np.errstate(over="ignore", invalid="ignore"):
         found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
-        is_finite = are_finite(found) or bool(np.isfinite(found).all())
+        is_finite = are_finite(found.T) or bool(np.isfinite(found).all())
     if not is_finite:
         raise ValueError(
             "coefficients must stay within floating point, got an overflow from "
@@ -387,7 +387,8 @@ def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
     jets = [w.jet for w in waypoints]
     sizes = list(map(len, jets))
     if len(set(sizes)) == 1 and all([w.complete for w in waypoints]):
-        return np.array(jets), [(tuple(range(sizes[0])),) * len(sizes)] * waypoints[0].naxes
+        table = joined(jets).reshape(len(jets), *jets[0].shape)
+        return table, [(tuple(range(sizes[0])),) * len(sizes)] * waypoints[0].naxes
     table = np.full((len(jets), max(sizes), jets[0].shape[1]), np.nan)
     for row, jet in zip(table, jets, strict=True):
         row[: len(jet)] = jet
