@@ -34,7 +34,7 @@ inside out (`one_time`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -59,6 +59,7 @@ from ctrlplan.trajectories.one_time import (
 )
 from ctrlplan.trajectories.quadrature import gauss
 from ctrlplan.trajectories.sampling import collocation
+from ctrlplan.trajectories.swing import MAXIMUM_SWING
 
 _MEET = 0.25
 """The ends coincide if their distance on the circle is below this fraction of that to all neighbours."""
@@ -540,15 +541,30 @@ class NewtonSystem(Fields):
     @cached_property
     def ranges(self) -> list[float]:
         """Bounds of the ranges of the basis functions from the second on, over the unit interval."""
-        return _ranges(effective(self.alpha), self._nodes.tolist())[: self.size - 1]
+        alpha, moments, (pairs, places) = effective(self.alpha), self._moments, self._pairs
+        peaks = [_pair_peaks(alpha, moments[i], moments[j]) for i, j in pairs]
+        return _ranges(alpha, self._nodes.tolist(), [peaks[place] for place in reversed(places)])[: self.size - 1]
 
     @cached_property
     def higher_ranges(self) -> Array:
         """The same from the third function on, as an array."""
         return readonly(np.array(self.ranges[1:]))
 
-    def stays_near(self, coefficients: Array, factor: float, spans: Callable[[], list[float]]) -> bool:
-        """Whether coefficients exclude ranges above a multiple of those of the positions.
+    @cached_property
+    def higher_norm(self) -> float:
+        """Root of the sum of the squares of the same."""
+        return math.sqrt(sum([value * value for value in self.ranges[1:]])) * (1.0 + 1e-12)
+
+    @cached_property
+    def _swings(self) -> list[float]:
+        """Ranges of all functions; of two waypoints without the range that their positions allow to the second."""
+        ranges = [0.0, *self.ranges]
+        if self.pattern.is_short == 2:
+            ranges[1] -= MAXIMUM_SWING * abs(self._triangle.item(1, 1))
+        return ranges
+
+    def stays_near(self, coefficients: Array, values: Array) -> bool:
+        """Whether coefficients are finite and exclude a swing far beyond the positions.
 
         Only for few waypoints; otherwise values of all functions are as fast as their
         ranges, and say more.
@@ -557,26 +573,17 @@ class NewtonSystem(Fields):
         ----------
         coefficients : ndarray, shape (size, naxes)
             Coefficients of some axes.
-        factor : float
-            The multiple.
-        spans : callable
-            Returns the ranges of the prescribed positions of these axes; it is not
-            called for two waypoints.
+        values : ndarray, shape (nconstraints, naxes)
+            The finite entries from which they are.
         """
-        if self._fold or not self.pattern.is_short:
+        count = self.pattern.is_short
+        if not count or self._fold:
             return False
-        columns, ranges = coefficients.T.tolist(), self.ranges
-        if self.pattern.is_short == 2:
-            slope = factor * abs(self._triangle.item(1, 1))
-            allowed = [slope * abs(column[1]) for column in columns]
-        else:
-            allowed = [factor * span for span in spans()]
-        return all(
-            [
-                sum(map(mul, map(abs, column[1:]), ranges)) <= limit
-                for column, limit in zip(columns, allowed, strict=True)
-            ]
-        )
+        ranges, columns = self._swings, coefficients.T.tolist()
+        if count == 2:  # the second coefficient is the difference of the positions
+            return all([sum(map(mul, ranges, map(abs, column))) <= 0.0 for column in columns])
+        rows = zip(columns, values[:count].T.tolist(), strict=True)
+        return all([sum(map(mul, ranges, map(abs, c))) <= MAXIMUM_SWING * (max(y) - min(y)) for c, y in rows])
 
     @cached_property
     def amplification(self) -> float:
@@ -741,29 +748,26 @@ def _taylor_scale(duration: float, orders: tuple[int, ...]) -> Array:
     return readonly(np.array([[powers[k]] for k in orders]))
 
 
-def _ranges(alpha: float, nodes: list[float]) -> list[float]:
+def _ranges(alpha: float, nodes: list[float], peaks: list[tuple[float, float]]) -> list[float]:
     """Bounds of the ranges of the basis functions from the second on, from the nodes.
 
-    Between the nodes a and b of a pair the product of both factors is largest at their
-    mean, outside at the end that is farther from it. Functions with nodes at the ends
+    The peaks of each pair are those of `_pair_peaks`. Functions with nodes at the ends
     only do not change their sign.
     """
     found: list[float] = []
     product, signed, alternate = 1.0, True, True  # signs do not change; each pair before has a node at each end
-    peaks: dict[tuple[float, float], tuple[float, float]] = {}
     few = alpha <= math.pi
-    for a, b in zip(nodes[::2], nodes[1::2], strict=False):
-        if (a, b) not in peaks:
-            peaks[a, b] = _pair_peaks(alpha, a, b)
-        alone, pair = peaks[a, b]
-        at_end = few and (a == 0.0 or a == 1.0)
+    for a, b, (alone, pair) in zip(nodes[::2], nodes[1::2], peaks, strict=False):
+        at_end = few and a in _ENDS
         if alternate and at_end:
             found.append(_odd_peak(alpha, len(found) // 2))
+            alternate = abs(b - a) == 1.0
         else:
-            found.append(product * alone * (1.0 if signed and at_end else 2.0))
-        alternate = alternate and abs(b - a) == 1.0
-        product, signed = product * pair, signed and (a in _ENDS and b in _ENDS)
-        found.append(product * (1.0 if signed else 2.0))
+            alternate = False
+            found.append(product * alone if signed and at_end else 2.0 * product * alone)
+        product *= pair
+        signed = signed and a in _ENDS and b in _ENDS
+        found.append(product if signed else 2.0 * product)
     return found
 
 
@@ -771,7 +775,11 @@ _ENDS = (0.0, 1.0)
 
 
 def _pair_peaks(alpha: float, a: float, b: float) -> tuple[float, float]:
-    """Maxima of the first factor of a pair of nodes, and of the product of both."""
+    """Maxima of the first factor of a pair of nodes, and of the product of both.
+
+    Between the nodes the product is largest at their mean, outside at the end that is
+    farther from it.
+    """
     mean, apart, alone = 0.5 * (a + b), abs(b - a), max(a, 1.0 - a)
     far = max(mean, 1.0 - mean)
     if not alpha:

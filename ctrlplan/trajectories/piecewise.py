@@ -35,6 +35,12 @@ from ctrlplan.trajectories.waypoint_spline import (
     same_times,
 )
 
+_ROOM = 0.5 * (MAXIMUM_SWING - 1.0)
+"""Range of what is added to the way from position to position, relative to theirs, that is no swing."""
+
+_TINY = 1e-100
+"""Root of a sum of squares below which they may have lost digits."""
+
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
@@ -392,8 +398,10 @@ class PiecewiseSpline(WaypointSpline):
         if self.alpha > math.pi:
             return False
         positions = self._entries.rows[:, 0]
+        if self._is_small(positions):
+            return True
         lowest, highest = np.minimum.reduce(positions, axis=1), np.maximum.reduce(positions, axis=1)
-        allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (highest - lowest)
+        allowed = _ROOM * (highest - lowest)
         limits = allowed.tolist()
         for pieces in self._pieces:
             axes = list(pieces.axes)
@@ -413,6 +421,28 @@ class PiecewiseSpline(WaypointSpline):
                 if not ((low >= (lowest - allowed)[axes]) & (high <= (highest + allowed)[axes])).all():
                     return False
         return True
+
+    def _is_small(self, positions: Array) -> bool:
+        """Whether the coefficients of all axes and segments together are small next to the range of each axis.
+
+        What the other functions of a segment add to the way from position to position
+        goes up and down by at most the sum of their ranges in all. By Schwarz's
+        inequality the root of all squares bounds that of one segment, and with the root
+        of 2 that of two segments, one of which may go up and the other one down.
+        """
+        bound = 0.0
+        for pieces in self._pieces:
+            for run in pieces.runs:
+                if not run.system.hermite:
+                    return False
+                flat = run.coefficients[2:].ravel()
+                bound = max(bound, run.system.higher_norm * math.sqrt(flat.dot(flat)))
+        if not bound > _TINY:  # squares may have underflowed
+            return False
+        # The sum is nan if a position is free.
+        spans = [max(own) - min(own) if sum(own) < math.inf else 0.0 for own in positions.tolist()]
+        room = 2.0 * _ROOM if self.breakpoints.size == 2 else _ROOM * math.sqrt(2.0)
+        return all([bound <= room * span for span in spans])
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
