@@ -268,7 +268,7 @@ def _check_kinds(values: Any, name: str) -> None:
         return
     if isinstance(values, list | tuple):
         for value in values:
-            if type(value) is not float:
+            if type(value) is not float and not (type(value) is np.ndarray and value.dtype.kind in "iuf"):
                 _check_kinds(value, name)
         return
     kind = getattr(getattr(values, "dtype", None), "kind", None)

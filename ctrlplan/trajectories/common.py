@@ -21,7 +21,7 @@ FACTORIALS.flags.writeable = False
 
 def readonly(values: Array) -> Array:
     """Same array, made read-only."""
-    values.flags.writeable = False
+    values.setflags(write=False)
     return values
 
 

@@ -167,6 +167,8 @@ class FreePattern:
         """Place of each unknown among the entries of an axis."""
         self.lowest = self._lowest(free)
         """Lowest free order, if all inner waypoints and no others have all orders from it on free; None otherwise."""
+        self.ends_only = self.lowest if self.lowest and given[:, : self.lowest].all() else 0
+        """The same if all lower orders are prescribed; otherwise, and for closed plans, 0."""
         self.rows = np.searchsorted(self.free_orders, self.orders) * (self.count + closed) + self.nodes
         """Place of each equation among the jumps of an axis."""
         self.prescribed = [self._prescribed(kind) for kind in self.kinds]
@@ -362,9 +364,9 @@ class FreeEntries:
         return self._assembled(self._terms)
 
     def _plain(self, equations: _Banded, rows: Array) -> Array:
-        offset, shifted = self._shifted(rows)
         with np.errstate(all="ignore"):
-            jumps = self._jumps(self._data(shifted, self._scale), self._terms, self.pattern.prescribed)
+            offset, data = self._shifted_data(rows)
+            jumps = self._jumps(data, self._terms, self.pattern.prescribed)
             return self._restored(equations.solve(-jumps), self._unknown_scale, offset)
 
     def _refined(self, equations: _Banded, rows: Array, tolerance: float) -> NDArray[np.longdouble] | None:
@@ -431,6 +433,22 @@ class FreeEntries:
         shifted[:, 0] -= offset[:, None]
         return offset, shifted
 
+    def _shifted_data(self, rows: Array) -> tuple[Array, Array]:
+        """First prescribed position of each axis, and the data relative to it."""
+        pattern, scale = self.pattern, self._scale
+        lowest, ends = pattern.ends_only, slice(None, None, pattern.count - 1)
+        if not lowest:
+            offset, shifted = self._shifted(rows)
+            return offset, self._data(shifted, scale)
+        offset, data = rows[:, 0, 0].copy(), np.zeros(rows.shape)
+        np.multiply(rows[:, :lowest], scale[:lowest], out=data[:, :lowest])
+        np.subtract(rows[:, 0], offset[:, None], out=data[:, 0])
+        data[:, 0] *= scale[0]
+        data[:, lowest:, ends] = (
+            np.where(pattern.mask[lowest:, ends], rows[:, lowest:, ends], 0.0) * scale[lowest:, ends]
+        )
+        return offset, data
+
     def _data(self, rows: NDArray[Any], scale: NDArray[Any]) -> NDArray[Any]:
         """Prescribed entries in the units of the waypoints, 0 where free."""
         return np.where(self.pattern.mask, rows, 0.0) * scale
@@ -493,9 +511,8 @@ class FreeEntries:
                     values = values - data[:, 0, left:right]
                 if not values.any():
                     continue
-                change = factors[:, :, n, inside] * values[:, None, None]
-                jumps[:, :, left:right] += change[:, 0]
-                jumps[:, :, left + 1 : right + 1] += change[:, 1]
+                for end, at in enumerate(factors[:, :, n, inside]):
+                    jumps[:, :, left + end : right + end] += at * values[:, None]
         if pattern.closed:
             jumps[:, :, 0] += jumps[:, :, -1]
         return np.asarray(jumps.reshape(naxes, -1).take(pattern.rows, axis=1))

@@ -39,6 +39,12 @@ class Fields(Frozen):
                 values[name].flags.writeable = False
         self.__dict__.update(values)
 
+    def _fill(self, **values: Any) -> None:
+        """Set fields as `_set_fields`, without its checks but that each is new; arrays must be read-only."""
+        if not values.keys().isdisjoint(self.__dict__):
+            self._set_fields(**values)  # raises
+        self.__dict__.update(values)
+
     def _with_fields(self, **values: Any) -> Self:
         """Copy with some fields changed and without cached values."""
         declared = _declared(type(self).__mro__)

@@ -34,14 +34,16 @@ inside out (`one_time`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from operator import mul
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas
+from scipy.linalg import blas, lapack
 
 from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
@@ -57,6 +59,7 @@ from ctrlplan.trajectories.one_time import (
 )
 from ctrlplan.trajectories.quadrature import gauss
 from ctrlplan.trajectories.sampling import collocation
+from ctrlplan.trajectories.swing import MAXIMUM_SWING
 
 _MEET = 0.25
 """The ends coincide if their distance on the circle is below this fraction of that to all neighbours."""
@@ -130,14 +133,8 @@ class NewtonSystem(Fields):
 
     alpha: float
     size: int
-    gamma: float | None  # of the top harmonic; None for odd sizes and for polynomials
-    waypoint_index: NDArray[np.intp]
-    order_index: NDArray[np.intp]
-    hermite: bool  # no gaps between the orders at any waypoint
-    _orders: tuple[int, ...]  # `order_index` as a key
-    _positions: Array  # 1 for a prescribed position, else 0
-    _anchor: int
-    _is_short: int
+    pattern: Pattern  # the constraints in the order of the Newton form
+    _gamma: float | None  # as given
     _triangle: Array
     _spread: Array | None
     _fold: float
@@ -159,72 +156,102 @@ class NewtonSystem(Fields):
         count = sum(map(len, given))
         if count == 0:
             raise ValueError("an axis must have at least one prescribed entry, got none")
-        size = count if size is None else size
         moments = times.tolist()
         ordered, meet = _leja(effective(alpha), moments, given, meet)
         pattern = (_stored_pattern if count <= _STORED else _pattern)(ordered, given, meet)
-        mean = math.fsum([moments[i] for i in pattern.at]) / count
-        phase, fold = _top_harmonic(alpha, size, mean, gamma)
         nodes = times.take(pattern.waypoints)
         beyond = times[:, None] - nodes if apart is None else apart.take(pattern.waypoints, axis=1)
+        if size is None:
+            size = count
+        fold = 0.0 if gamma is None else _fold(alpha, size, pattern.mean(moments), gamma)
         pairs = pattern.pairs
         if size > count:
-            spare = _spare_nodes(mean, size - count)
+            spare = _spare_nodes(pattern.mean(moments), size - count)
             moments = [*moments, *spare.tolist()]
             pairs = _pairs([*pattern.at, *range(len(times), len(moments))])
             nodes, beyond = np.concatenate([nodes, spare]), np.hstack([beyond, times[:, None] - spare])
-        self._set_fields(
+        self._fill(
             alpha=alpha,
             size=size,
-            gamma=phase,
-            waypoint_index=pattern.waypoints,
-            order_index=pattern.orders,
-            hermite=pattern.hermite,
-            _orders=pattern.keys,
-            _positions=pattern.positions,
-            _anchor=pattern.anchor,
-            _is_short=pattern.is_short,
+            pattern=pattern,
+            _gamma=gamma,
             _fold=fold,
             _nodes=readonly(nodes),
             _moments=moments,
             _pairs=pairs,
         )
-        if not effective(alpha) and apart is None and size == count and pattern.places is not None:
-            collocation = _products_at_nodes(beyond, pattern.apart, pattern.places, max(pattern.keys))
+        if pattern.places is None or apart is not None or size > count or fold:
+            collocation = self._collocation(beyond)
         else:
-            collocation = self._collocation(beyond, pattern)
+            collocation = _products_at_nodes(beyond, 0.5 * effective(alpha), pattern, pattern.places)
         spread = None
         if not pattern.hermite or size > count:
             roughness = self.squared_samples(smooth) if size > count else None
             collocation, spread = _factor(collocation, pattern.hermite, roughness, pattern.lead)
-        self._set_fields(_triangle=readonly(np.asfortranarray(collocation)), _spread=spread)
+        self._fill(_triangle=readonly(np.asfortranarray(collocation)), _spread=spread)
         if np.count_nonzero(self._triangle.diagonal()) < count:
             raise ValueError("the constraints must determine the plan, got a singular system")
 
+    @property
+    def waypoint_index(self) -> NDArray[np.intp]:
+        """Waypoint of each constraint."""
+        return self.pattern.waypoints
+
+    @property
+    def order_index(self) -> NDArray[np.intp]:
+        """Order of each constraint."""
+        return self.pattern.orders
+
+    @property
+    def hermite(self) -> bool:
+        """Whether no order is left out between others at any waypoint."""
+        return self.pattern.hermite
+
+    @property
+    def gamma(self) -> float | None:
+        """Phase [rad of tau] of the top harmonic; None for odd sizes and for polynomials."""
+        if self._gamma is not None or self.size % 2 or not self.alpha:
+            return self._gamma
+        return self.alpha * self.pattern.mean(self._moments)
+
+    def entries(self, table: NDArray[Any]) -> NDArray[Any]:
+        """Entries (nconstraints, naxes) of a table (nwaypoints, norders, naxes)."""
+        pattern, (_, norders, naxes) = self.pattern, table.shape
+        if norders > pattern.order + 1:
+            return np.asarray(table[pattern.waypoints, pattern.orders])
+        return table.reshape(-1, naxes).take(pattern.rows, axis=0)
+
     def taylor_scale(self, duration: float) -> Array:
         """Factors from prescribed derivatives to normalised Taylor data, as a column."""
-        return _taylor_scale(duration, self._orders)
+        return _taylor_scale(duration, self.pattern.keys)
 
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
         # Positions relative to the first one: a common offset costs no digits of their differences.
-        offset = taylor_data[self._anchor] * self._positions[self._anchor]
+        offset, data = self._shifted(taylor_data)
         # Not LAPACK's dtrtrs, whose threads are slow for small systems.
-        solved = blas.dtrsm(1.0, self._triangle, taylor_data - self._positions * offset, lower=1)
+        solved = blas.dtrsm(1.0, self._triangle, data, lower=1)
         found = solved if self._spread is None else self._spread @ solved
         found[0] += offset
         return found
+
+    def _shifted(self, taylor_data: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """First prescribed position of each column, and the data relative to it, as a new array."""
+        pattern = self.pattern
+        offset = taylor_data[pattern.anchor]
+        if not pattern.leading:
+            offset = offset * pattern.positions[pattern.anchor]
+            return offset, taylor_data - pattern.positions * offset
+        data = taylor_data.copy()
+        data[: pattern.leading] -= offset
+        return offset, data
 
     def coefficients_of_many(self, taylor_data: NDArray[Any]) -> Array:
         """The same for many columns, which are overwritten, by one product where that is as accurate."""
         if self._inverse is None or taylor_data.dtype != np.float64:
             return self.coefficients_of(taylor_data)
-        offset = taylor_data[self._anchor].copy()
-        count = self._orders.count(0)
-        if any(self._orders[:count]):
-            taylor_data[self.order_index == 0] -= offset
-        else:
-            taylor_data[:count] -= offset
+        offset, leading = taylor_data[self.pattern.anchor].copy(), self.pattern.leading
+        taylor_data[slice(leading) if leading else self.order_index == 0] -= offset
         found: Array = self._inverse @ taylor_data
         found[0] += offset
         return found
@@ -232,7 +259,7 @@ class NewtonSystem(Fields):
     @cached_property
     def _inverse(self) -> Array | None:
         """Matrix from Taylor data to coefficients; None where it loses digits."""
-        if self._spread is not None or not self._positions[self._anchor, 0] or self.amplification > _PRODUCT:
+        if self._spread is not None or 0 not in self.pattern.keys or self.amplification > _PRODUCT:
             return None
         return readonly(np.ascontiguousarray(blas.dtrsm(1.0, self._triangle, np.eye(self.size), lower=1)))
 
@@ -240,8 +267,7 @@ class NewtonSystem(Fields):
         """The same for entries of a complete jet at each waypoint, with the digits of extended numbers."""
         if taylor_data.dtype == np.float64 or self._spread is not None:
             return self.coefficients(taylor_data.astype(float, copy=False))
-        offset = taylor_data[self._anchor] * self._positions[self._anchor]
-        found = taylor_data - self._positions * offset
+        offset, found = self._shifted(taylor_data)
         triangle = self._triangle.astype(found.dtype)
         for n in range(len(triangle)):
             found[n] = (found[n] - triangle[n, :n] @ found[:n]) / triangle[n, n]
@@ -339,7 +365,7 @@ class NewtonSystem(Fields):
             out[self.size - 1] += self._fold * out[self.size]
         return out[: self.size]
 
-    def _collocation(self, beyond: Array, pattern: _Pattern) -> Array:
+    def _collocation(self, beyond: Array) -> Array:
         """Prescribed Taylor coefficients (nconstraints, size) of every basis function.
 
         As `_taylor`, by matrices that multiply series by the factors of each pair: fewer
@@ -349,9 +375,8 @@ class NewtonSystem(Fields):
         ----------
         beyond : ndarray, shape (nwaypoints, size)
             Distances of the waypoints to the nodes.
-        pattern : _Pattern
-            The constraints.
         """
+        pattern = self.pattern
         half, n = 0.5 * effective(self.alpha), max(pattern.keys) + 1
         count, npairs = len(beyond), self.size // 2
         angles = np.empty((3, npairs, count))  # of both factors of each pair, and their sum
@@ -506,7 +531,7 @@ class NewtonSystem(Fields):
         """
         if self._is_mild:
             return 0.0
-        data = taylor_data - self._positions * taylor_data[self._anchor]
+        _, data = self._shifted(taylor_data)
         solved = blas.dtrsm(1.0, self._triangle, data, lower=1)
         rounding = np.finfo(float).eps * (np.abs(self._triangle) @ np.abs(solved))
         functions, cardinal = self._samples
@@ -535,15 +560,30 @@ class NewtonSystem(Fields):
     @cached_property
     def ranges(self) -> list[float]:
         """Bounds of the ranges of the basis functions from the second on, over the unit interval."""
-        return _ranges(effective(self.alpha), self._nodes.tolist())[: self.size - 1]
+        alpha, moments, (pairs, places) = effective(self.alpha), self._moments, self._pairs
+        peaks = [_pair_peaks(alpha, moments[i], moments[j]) for i, j in pairs]
+        return _ranges(alpha, self._nodes.tolist(), [peaks[place] for place in reversed(places)])[: self.size - 1]
 
     @cached_property
     def higher_ranges(self) -> Array:
         """The same from the third function on, as an array."""
         return readonly(np.array(self.ranges[1:]))
 
-    def stays_near(self, coefficients: Array, factor: float, spans: Callable[[], list[float]]) -> bool:
-        """Whether coefficients exclude ranges above a multiple of those of the positions.
+    @cached_property
+    def higher_norm(self) -> float:
+        """Root of the sum of the squares of the same."""
+        return math.sqrt(sum([value * value for value in self.ranges[1:]])) * (1.0 + 1e-12)
+
+    @cached_property
+    def _swings(self) -> list[float]:
+        """Ranges of all functions; of two waypoints without the range that their positions allow to the second."""
+        ranges = [0.0, *self.ranges]
+        if self.pattern.is_short == 2:
+            ranges[1] -= MAXIMUM_SWING * abs(self._triangle.item(1, 1))
+        return ranges
+
+    def stays_near(self, coefficients: Array, values: Array) -> bool:
+        """Whether coefficients are finite and exclude a swing far beyond the positions.
 
         Only for few waypoints; otherwise values of all functions are as fast as their
         ranges, and say more.
@@ -552,26 +592,17 @@ class NewtonSystem(Fields):
         ----------
         coefficients : ndarray, shape (size, naxes)
             Coefficients of some axes.
-        factor : float
-            The multiple.
-        spans : callable
-            Returns the ranges of the prescribed positions of these axes; it is not
-            called for two waypoints.
+        values : ndarray, shape (nconstraints, naxes)
+            The finite entries from which they are.
         """
-        if self._fold or not self._is_short:
+        count = self.pattern.is_short
+        if not count or self._fold:
             return False
-        columns, ranges = coefficients.T.tolist(), self.ranges
-        if self._is_short == 2:
-            slope = factor * abs(self._triangle.item(1, 1))
-            allowed = [slope * abs(column[1]) for column in columns]
-        else:
-            allowed = [factor * span for span in spans()]
-        return all(
-            [
-                sum(map(mul, map(abs, column[1:]), ranges)) <= limit
-                for column, limit in zip(columns, allowed, strict=True)
-            ]
-        )
+        ranges, columns = self._swings, coefficients.T.tolist()
+        if count == 2:  # the second coefficient is the difference of the positions
+            return all([sum(map(mul, ranges, map(abs, column))) <= 0.0 for column in columns])
+        rows = zip(columns, values[:count].T.tolist(), strict=True)
+        return all([sum(map(mul, ranges, map(abs, c))) <= MAXIMUM_SWING * (max(y) - min(y)) for c, y in rows])
 
     @cached_property
     def amplification(self) -> float:
@@ -587,8 +618,9 @@ class NewtonSystem(Fields):
         values is above the sum of a row of the inverse, which the root of its squares
         bounds. Nothing more is needed for nearly all systems.
         """
-        _, inverse = self._scaled
-        return len(inverse) * float(np.vdot(inverse, inverse)) < _SUSPECT**2 or self.amplification < _SUSPECT
+        inverse, _ = lapack.dtrtri(self._triangle, 1)
+        inverse *= np.maximum.reduce(np.abs(self._triangle.T), 1)[:, None]
+        return len(inverse) ** 0.5 * lapack.dlange("F", inverse) < _SUSPECT or self.amplification < _SUSPECT
 
     @property
     def _scaled(self) -> tuple[Array, Array]:
@@ -611,27 +643,46 @@ class NewtonSystem(Fields):
         return (FACTORIALS[order] * np.sqrt(weights) * self.taylor(nodes, order)[:, order]).T
 
 
-def _products_at_nodes(beyond: Array, apart: Array, places: NDArray[np.intp], order: int) -> Array:
-    """Collocation of polynomials: each product without its factors that are 0, by elementary symmetric sums.
+def _products_at_nodes(beyond: Array, half: float, pattern: Pattern, places: NDArray[np.intp]) -> Array:
+    r"""Collocation by elementary symmetric sums: each product without its factors that are 0.
 
-    With the ratios 1/(x - x_i) of its other factors, the coefficient k of such a
-    product is its value times their sum of order k, and each factor that is 0 moves
-    the coefficients up an order.
+    With the ratios q'/q of its other factors, a product of N factors, z of them 0, is
+    about a node its value V without the latter times
+
+    .. math:: \sum_k e_k S(h)^{z+k} C(h)^{N-z-k}
+
+    with S and C as in `NewtonSystem.taylor_between`, to the third order of h
+
+    .. math:: S^p C^{N-p} = h^p (1 - (3 N - 2 p) (\alpha/2)^2 h^2/6)
+
+    A cosine c(h) cos a - S(h) (alpha/2) sin a is one more factor.
 
     Parameters
     ----------
-    beyond : ndarray, shape (nwaypoints, size)
+    beyond : ndarray, shape (nwaypoints, nconstraints)
         Distances of the waypoints to the nodes.
-    apart, places
-        As of `_Pattern`.
-    order : int
-        Highest coefficient.
+    half : float
+        Half of alpha [rad].
+    pattern : Pattern
+        The constraints, of which all nodes are.
+    places : ndarray
+        As of the pattern.
     """
-    factors = beyond + (1.0 - apart)  # those at their own waypoints are 0
-    ratio = apart / factors
-    sums = np.zeros((max(order, 1) + 1, len(beyond), beyond.shape[1] + 1))
+    order = pattern.order
+    sums = np.zeros((max(order, 1) + 1, *beyond.shape))  # V e_k
     value = sums[0]
     value[:, 0] = 1.0
+    if half:
+        angle = beyond * (half * pattern.halves)  # of all sines, and of the cosines
+        sine, cosine = np.sin(angle), np.cos(angle)
+        factors = sine[0] / half
+        factors += pattern.own
+        ratio = pattern.apart * cosine[0]
+        ratio /= factors
+    else:
+        factors = beyond + pattern.own
+        ratio = pattern.apart / factors
+    factors, ratio = factors[:, :-1], ratio[:, :-1]
     np.multiply.accumulate(factors, axis=1, out=value[:, 1:])
     terms = ratio
     for k in range(1, order + 1):
@@ -639,7 +690,13 @@ def _products_at_nodes(beyond: Array, apart: Array, places: NDArray[np.intp], or
         if k < order:
             terms = ratio * sums[k, :, :-1]
     sums[1:] *= value
-    return np.asarray(sums.ravel().take(places).T)
+    if half:
+        turned = half * sine[1] * sums[:-1]
+        sums *= cosine[1]
+        sums[1:] -= turned
+        if order > 1:
+            sums[2:] -= (half * half) * pattern.cosines * sums[:-2]
+    return sums.ravel().take(places).T
 
 
 def _next(ratio: Array, lower: Array | Sequence[Array], bend: float) -> Array:
@@ -677,40 +734,38 @@ def shared_system(
 @lru_cache(maxsize=256)
 def _taylor_scale(duration: float, orders: tuple[int, ...]) -> Array:
     """Powers of a duration over factorials, as a column."""
-    exponents = np.array(orders)
-    with np.errstate(over="ignore", under="ignore"):
-        scale: Array = (duration**exponents / FACTORIALS[exponents])[:, None]
-    if not (scale.min() > 1e-290 and scale.max() < np.inf):
+    try:
+        powers = [duration**k / math.factorial(k) for k in range(max(orders) + 1)]
+    except OverflowError:
+        powers = [0.0]
+    if not 1e-290 < powers[-1] < math.inf:
         raise ValueError(
             f"powers of the duration must stay within floating point, got {duration:g} s to the power "
             f"{max(orders)}; choose another unit of time"
         )
-    return readonly(scale)
+    return readonly(np.array([[powers[k]] for k in orders]))
 
 
-def _ranges(alpha: float, nodes: list[float]) -> list[float]:
+def _ranges(alpha: float, nodes: list[float], peaks: list[tuple[float, float]]) -> list[float]:
     """Bounds of the ranges of the basis functions from the second on, from the nodes.
 
-    Between the nodes a and b of a pair the product of both factors is largest at their
-    mean, outside at the end that is farther from it. Functions with nodes at the ends
+    The peaks of each pair are those of `_pair_peaks`. Functions with nodes at the ends
     only do not change their sign.
     """
     found: list[float] = []
     product, signed, alternate = 1.0, True, True  # signs do not change; each pair before has a node at each end
-    peaks: dict[tuple[float, float], tuple[float, float]] = {}
     few = alpha <= math.pi
-    for a, b in zip(nodes[::2], nodes[1::2], strict=False):
-        if (a, b) not in peaks:
-            peaks[a, b] = _pair_peaks(alpha, a, b)
-        alone, pair = peaks[a, b]
-        at_end = few and (a == 0.0 or a == 1.0)
+    for a, b, (alone, pair) in zip(nodes[::2], nodes[1::2], peaks, strict=False):
+        at_end = few and a in _ENDS
         if alternate and at_end:
             found.append(_odd_peak(alpha, len(found) // 2))
+            alternate = abs(b - a) == 1.0
         else:
-            found.append(product * alone * (1.0 if signed and at_end else 2.0))
-        alternate = alternate and abs(b - a) == 1.0
-        product, signed = product * pair, signed and (a in _ENDS and b in _ENDS)
-        found.append(product * (1.0 if signed else 2.0))
+            alternate = False
+            found.append(product * alone if signed and at_end else 2.0 * product * alone)
+        product *= pair
+        signed = signed and a in _ENDS and b in _ENDS
+        found.append(product if signed else 2.0 * product)
     return found
 
 
@@ -718,7 +773,11 @@ _ENDS = (0.0, 1.0)
 
 
 def _pair_peaks(alpha: float, a: float, b: float) -> tuple[float, float]:
-    """Maxima of the first factor of a pair of nodes, and of the product of both."""
+    """Maxima of the first factor of a pair of nodes, and of the product of both.
+
+    Between the nodes the product is largest at their mean, outside at the end that is
+    farther from it.
+    """
     mean, apart, alone = 0.5 * (a + b), abs(b - a), max(a, 1.0 - a)
     far = max(mean, 1.0 - mean)
     if not alpha:
@@ -766,7 +825,8 @@ def _pairs(nodes: Sequence[int]) -> _Pairs:
     return list(pairs), places[::-1]
 
 
-class _Pattern(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Pattern:
     """Constraints in the order of the Newton form.
 
     Attributes
@@ -775,75 +835,126 @@ class _Pattern(NamedTuple):
         Waypoint and order of each constraint.
     waypoints, orders : ndarray of int, shape (nconstraints,)
         The same as arrays.
-    positions : ndarray, shape (nconstraints, 1)
-        1 for a prescribed position, else 0.
-    anchor : int
-        First prescribed position.
     hermite : bool
         Whether no order is left out at any waypoint.
     lead : int
         Number of constraints of ends that coincide.
-    is_short : int
-        Number of waypoints if they are few and begin with their positions, else 0.
-    pairs : _Pairs
-        Pairs of waypoints, as nodes.
-    apart : ndarray, shape (nwaypoints, nconstraints)
-        1 for a node that is not at a waypoint, else 0.
-    places : ndarray of int, shape (nconstraints, nconstraints), or None
-        Place in the sums of `_products_at_nodes` of each function, by constraint; None for many constraints or
-        high orders.
+    nwaypoints : int
+        Number of waypoints, with those without constraints.
     """
 
     at: tuple[int, ...]
     keys: tuple[int, ...]
     waypoints: NDArray[np.intp]
     orders: NDArray[np.intp]
-    positions: Array
-    anchor: int
     hermite: bool
     lead: int
-    is_short: int
-    pairs: _Pairs
-    apart: Array
-    places: NDArray[np.intp] | None
+    nwaypoints: int
+
+    def mean(self, moments: Sequence[float]) -> float:
+        """Mean of the constraints' times."""
+        return math.fsum([moments[i] for i in self.at]) / len(self.at)
+
+    @cached_property
+    def order(self) -> int:
+        """Highest order."""
+        return max(self.keys)
+
+    @cached_property
+    def rows(self) -> NDArray[np.intp]:
+        """Place of each constraint in a table of all orders of each waypoint."""
+        found = self.waypoints * (self.order + 1) + self.orders
+        found.flags.writeable = False
+        return found
+
+    @cached_property
+    def positions(self) -> Array:
+        """1 for a prescribed position, else 0, (nconstraints, 1)."""
+        return readonly((self.orders == 0).astype(float)[:, None])
+
+    @cached_property
+    def anchor(self) -> int:
+        """First prescribed position; 0 if there is none."""
+        return self.keys.index(0) if 0 in self.keys else 0
+
+    @cached_property
+    def leading(self) -> int:
+        """Number of prescribed positions if these are the first constraints, else 0."""
+        count = self.keys.count(0)
+        return 0 if any(self.keys[:count]) else count
+
+    @cached_property
+    def is_short(self) -> int:
+        """Number of waypoints if they are few and begin with their positions, else 0."""
+        number = len(set(self.at))
+        return number if 2 <= number <= _SHORT and number == self.leading else 0
+
+    @cached_property
+    def pairs(self) -> _Pairs:
+        """Pairs of waypoints, as nodes."""
+        return _pairs(self.at)
+
+    @cached_property
+    def own(self) -> Array:
+        """1 for a node at the waypoint itself, else 0, (nwaypoints, nconstraints)."""
+        return readonly((np.arange(self.nwaypoints)[:, None] == self.waypoints).astype(float))
+
+    @cached_property
+    def apart(self) -> Array:
+        """0 for a node at the waypoint itself, else 1."""
+        return readonly(1.0 - self.own)
+
+    @cached_property
+    def halves(self) -> Array:
+        """1 for the sine of each node, and for the cosine of every second one, (2, 1, nconstraints)."""
+        number = np.arange(len(self.at))
+        return readonly(np.array([[number >= 0], [number % 2 == 1]], dtype=float))
+
+    @cached_property
+    def zeros(self) -> NDArray[np.intp]:
+        """Number of sines of each function that are 0 at a waypoint, (nwaypoints, nconstraints)."""
+        found = np.zeros(self.own.shape, dtype=np.intp)
+        np.cumsum(self.own[:, :-1], axis=1, out=found[:, 1:], dtype=np.intp)
+        found.flags.writeable = False
+        return found
+
+    @cached_property
+    def places(self) -> NDArray[np.intp] | None:
+        """Place in the sums of `_products_at_nodes` of each function, by constraint.
+
+        Coefficients below the number of factors that are 0 are 0, as the first sum of
+        order 1 is. None for many constraints or high orders.
+        """
+        count = len(self.at)
+        if count > _STORED or self.order > _ELEMENTARY:
+            return None
+        left = self.orders - self.zeros[self.waypoints].T
+        found = (left * self.nwaypoints + self.waypoints) * count + np.arange(count)[:, None]
+        found = np.where(left >= 0, found, self.nwaypoints * count)
+        found.flags.writeable = False
+        return found
+
+    @cached_property
+    def cosines(self) -> Array:
+        """Reduction of sums 2 and 3 by powers of cosines, (order - 1, nwaypoints, nconstraints)."""
+        factors, orders = _factors(len(self.at))[:, 0], np.arange(self.order - 1)[:, None, None]
+        return readonly((3.0 * factors - 2.0 * (orders + self.zeros)) / 6.0)
 
 
-def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> _Pattern:
+def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> Pattern:
     """Constraints of waypoints in Leja order; ends that coincide come first with all their entries."""
     first = _sequence(ordered[:2], given) if meet else []
     pairs = first + _sequence(ordered[2:] if meet else ordered, given)
     at, keys = (tuple(column) for column in zip(*pairs, strict=True))
-    orders = np.array(keys, dtype=np.intp)
-    waypoints, positions = np.array(at, dtype=np.intp), (orders == 0).astype(float)[:, None]
-    apart = np.arange(len(given))[:, None] != waypoints
-    distinct = apart.astype(float)
-    for array in (orders, waypoints, positions, distinct):
+    waypoints, orders = np.array(at, dtype=np.intp), np.array(keys, dtype=np.intp)
+    for array in (waypoints, orders):
         array.flags.writeable = False
     hermite = all([own == tuple(range(len(own))) for own in given])
-    number = len(set(at))
-    is_short = number if 2 <= number <= _SHORT and keys[:number] == (0,) * number else 0
-    anchor = int((orders == 0).argmax())
-    places = _places(apart, orders, waypoints) if len(at) <= _STORED and max(keys) <= _ELEMENTARY else None
-    lead = len(first)
-    return _Pattern(
-        at, keys, waypoints, orders, positions, anchor, hermite, lead, is_short, _pairs(at), distinct, places
-    )
-
-
-def _places(apart: NDArray[np.bool_], orders: NDArray[np.intp], waypoints: NDArray[np.intp]) -> NDArray[np.intp]:
-    """As of `_Pattern`; coefficients below the number of factors that are 0 are 0, as the first sum of order 1 is."""
-    nwaypoints, count = apart.shape
-    zeros = np.zeros((nwaypoints, count), dtype=np.intp)
-    zeros[:, 1:] = np.cumsum(~apart[:, :-1], axis=1)
-    left = orders - zeros.T[:, waypoints]
-    found = (left * nwaypoints + waypoints) * (count + 1) + np.arange(count)[:, None]
-    found = np.where(left >= 0, found, nwaypoints * (count + 1))
-    found.flags.writeable = False
-    return found
+    return Pattern(at, keys, waypoints, orders, hermite, len(first), len(given))
 
 
 @lru_cache(maxsize=256)
-def _stored_pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> _Pattern:
+def _stored_pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> Pattern:
     """The same, stored for other times."""
     return _pattern(ordered, given, meet)
 
@@ -857,25 +968,26 @@ def _leja(
     coincide come first: as their data agree, the divided differences between them
     are 0 or small, and no others are divided by their distance.
     """
-    used = [i for i, g in enumerate(given) if g]
-    u, half, sin = [times[i] for i in used], 0.5 * alpha, math.sin
-
-    def distances(v: float) -> list[float]:
-        return [abs(sin(half * (w - v))) for w in u] if half else [abs(w - v) for w in u]
-
-    product = distances(u[0])
+    used = [i for i, own in enumerate(given) if own]
+    u = times if len(used) == len(times) else [times[i] for i in used]
+    half, last, sin = 0.5 * alpha, len(u) - 1, math.sin
+    product = [abs(sin(half * (w - u[0]))) for w in u] if half else [w - u[0] for w in u]
     if meet:
-        nearest = min([distances(v)[i] for i, v in enumerate(u[:-1], 1)], default=0.0)
-        meet = len(used) > 2 and product[-1] < _MEET * nearest
+        nearest = min([abs(sin(half * (w - v))) if half else w - v for v, w in pairwise(u)], default=0.0)
+        meet = last > 1 and product[-1] < _MEET * nearest
     chosen = [0]
-    while len(chosen) < len(u) - 1:
-        # Rescaled, so that the products do not underflow for many waypoints.
-        farthest = len(u) - 1 if meet and len(chosen) == 1 else product.index(max(product))
+    while len(chosen) < last:
+        farthest = last if meet and len(chosen) == 1 else product.index(max(product))
         chosen.append(farthest)
-        if len(chosen) < len(u) - 1:
-            scale = product[farthest] or 1.0
-            product = [p * (d / scale) for p, d in zip(product, distances(u[farthest]), strict=True)]
-    chosen += set(range(len(u))) - set(chosen)
+        if len(chosen) < last:
+            # Rescaled, so that the products do not underflow for many waypoints.
+            scale, v = product[farthest] or 1.0, u[farthest]
+            if half:
+                product = [p * (abs(sin(half * (w - v))) / scale) for p, w in zip(product, u, strict=True)]
+            else:
+                product = [p * (abs(w - v) / scale) for p, w in zip(product, u, strict=True)]
+    if last:
+        chosen.append(last * (last + 1) // 2 - sum(chosen))  # the only one that is left
     return tuple([used[i] for i in chosen]), meet
 
 
@@ -900,25 +1012,16 @@ def _spare_nodes(mean: float, count: int) -> Array:
     return mean + reach * np.cos(np.pi * (np.arange(count) + 0.5) / count)
 
 
-def _top_harmonic(alpha: float, size: int, mean: float, gamma: float | None) -> tuple[float | None, float]:
-    """Phase of the top harmonic, if there is one, and the fold weight for a given gamma."""
-    if size % 2 or not alpha:
-        if gamma is not None:
-            why = f"{size} coefficients" if size % 2 else "alpha = 0"
-            raise ValueError(f"gamma requires an even number of coefficients and alpha > 0, got {why}")
-        return None, 0.0
-    if gamma is None:
-        return alpha * mean, 0.0
-    return gamma, _fold(alpha, size, alpha * mean - gamma)
-
-
-def _fold(alpha: float, size: int, offset: float) -> float:
-    """Weight of phi_M in the last function for a given phase gamma of the top harmonic.
+def _fold(alpha: float, size: int, mean: float, gamma: float) -> float:
+    """Weight of the next function in the last one for a given phase of the top harmonic.
 
     The leading parts of phi_M and phi_{M-1} are cos and sin of m(tau - mean) in
     the ratio 2/alpha : -1, M = 2m; the sum must have no component cos m(tau - gamma).
     """
-    angle = 0.5 * size * offset
+    if size % 2 or not alpha:
+        why = f"{size} coefficients" if size % 2 else "alpha = 0"
+        raise ValueError(f"gamma requires an even number of coefficients and alpha > 0, got {why}")
+    angle = 0.5 * size * (alpha * mean - gamma)
     if abs(math.cos(angle)) < 1e-9:
         raise ValueError(
             "gamma must not make the system singular: m (mean - gamma) must differ from pi/2 modulo pi, "

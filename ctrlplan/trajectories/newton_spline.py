@@ -19,8 +19,8 @@ from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, shared_system
 from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
 from ctrlplan.trajectories.sampling import Interpolant
-from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing, within
-from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.swing import warn_of_swing, within
+from ctrlplan.trajectories.waypoint import Waypoint, joined
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
 
 _SHARED = 24
@@ -87,8 +87,9 @@ class NewtonSpline(WaypointSpline):
         ValueError
             If a time differs.
         """
-        plan = self._again(same_times(waypoints, self.waypoints), self._options)
-        plan._check_swing()
+        plan, near = self._fitted_again(same_times(waypoints, self.waypoints), self._options)
+        if not near:
+            plan._check_swing()
         return plan
 
     def through(self, waypoints: Iterable[Waypoint]) -> Self:
@@ -100,8 +101,9 @@ class NewtonSpline(WaypointSpline):
             As the constructor of this kind.
         """
         points = same_axes(checked_waypoints(waypoints, 2 if self._options.period is None else 1), self.naxes)
-        plan = self._again(points, self._options)
-        plan._check_swing()
+        plan, near = self._fitted_again(points, self._options)
+        if not near:
+            plan._check_swing()
         return plan
 
     @property
@@ -115,8 +117,11 @@ class NewtonSpline(WaypointSpline):
         alpha: float,
         options: SplineOptions,
         donor: NewtonSpline | None = None,
-    ) -> None:
-        """Set all attributes; the factorised systems of a `donor` of the same pattern are reused."""
+    ) -> bool:
+        """Set all attributes; the factorised systems of a `donor` of the same pattern are reused.
+
+        Returns whether no swing has to be measured: it is excluded, or no warning is wanted.
+        """
         times = [w.time for w in waypoints]
         start, period = times[0], options.period
         duration = times[-1] - start if period is None else period
@@ -133,7 +138,7 @@ class NewtonSpline(WaypointSpline):
         lent = donor._systems if donor and (same_times or _same_pattern(donor, relative, apart)) else {}
         table, patterns = given_entries(waypoints)
         systems: dict[Kind, NewtonSystem] = {}
-        parts = []
+        parts, near = [], options.warn
         for kind, axes in _groups(patterns, options.gamma, _meeting(table, alpha)).items():
             given, _, _ = kind
             system = lent.get(kind)
@@ -141,17 +146,21 @@ class NewtonSpline(WaypointSpline):
                 size = _size(alpha, sum(map(len, given)), options.degree)
                 system = _system(alpha, relative, apart, kind, size, options.smooth)
             systems[kind] = system
-            data = table[system.waypoint_index, system.order_index]
+            data = system.entries(table)
             if len(axes) < table.shape[2]:
                 data = data[:, axes]
-            parts.append((axes, system, _solved(system, data, times, duration)))
+            found = _fitted(system, data, times, duration)
+            near = near and system.stays_near(found, data)
+            if not near:
+                _check_finite(found, data, duration)
+            parts.append((axes, system, found))
         if donor is not None and len(donor.labels) == table.shape[2]:
             labels = donor.labels
         else:
             labels = checked_labels(options.labels or waypoints[0].labels, table.shape[2])
         moments = [start, times[-1] if period is None else start + period]
         breakpoints = donor.breakpoints if donor is not None and same_times else readonly(np.array(moments))
-        self._set_fields(
+        self._fill(
             waypoints=waypoints,
             alpha=alpha,
             labels=labels,
@@ -165,24 +174,19 @@ class NewtonSpline(WaypointSpline):
             _systems=systems,
             _parts=parts,
         )
+        return near or not options.warn
 
     def _again(self, waypoints: tuple[Waypoint, ...], options: SplineOptions) -> Self:
-        """Plan of this kind through other waypoints; reuses the factorised systems."""
+        """Plan of this kind through other waypoints, without a warning; reuses the factorised systems."""
+        return self._fitted_again(waypoints, options)[0]
+
+    def _fitted_again(self, waypoints: tuple[Waypoint, ...], options: SplineOptions) -> tuple[Self, bool]:
+        """The same, and whether no swing has to be measured."""
         plan = type(self).__new__(type(self))
-        plan._fit(increasing(waypoints), self.alpha, options, self)
-        return plan
+        return plan, plan._fit(increasing(waypoints), self.alpha, options, self)
 
     def _check_swing(self) -> None:
-        """Warn, unless disabled, if the plan swings far beyond its waypoints."""
-        if not self._options.warn:
-            return
-
-        def spans() -> list[float]:
-            positions = zip(*[w.jet[0].tolist() for w in self.waypoints], strict=True)
-            return [max(own) - min(own) for own in positions]
-
-        if len(self._parts) == 1 and self._parts[0][1].stays_near(self._parts[0][2], MAXIMUM_SWING, spans):
-            return
+        """Warn if the plan swings far beyond its waypoints."""
         if len(self._parts) == 1:
             _, system, coefficients = self._parts[0]
             values = coefficients.T @ system.functions
@@ -207,7 +211,7 @@ class NewtonSpline(WaypointSpline):
         """
         parts = []
         for axes, system, coefficients in self._parts:
-            values = table[system.waypoint_index, system.order_index][:, list(axes)]
+            values = system.entries(table)[:, list(axes)]
             if system.hermite:
                 coefficients = system.resolved(values, self._times, self._duration, digits)
             parts.append((axes, system, coefficients))
@@ -347,17 +351,20 @@ def _system(
     return NewtonSystem(alpha, np.array(relative), given, gamma, size, smooth, meet, apart)
 
 
-def _solved(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:
-    """Coefficients from prescribed derivatives (nconstraints, naxes)."""
+def _fitted(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:
+    """Coefficients from prescribed derivatives (nconstraints, naxes), which may overflow."""
+    scale = system.taylor_scale(duration)
     with np.errstate(over="ignore", invalid="ignore"):
-        found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
-        is_finite = are_finite(found) or bool(np.isfinite(found).all())
-    if not is_finite:
+        return system.fitted(data, times, duration, data * scale)
+
+
+def _check_finite(found: Array, data: Array, duration: float) -> None:
+    """Raise for coefficients that are not finite."""
+    if not (are_finite(found.T) or np.isfinite(found).all()):
         raise ValueError(
             "coefficients must stay within floating point, got an overflow from "
             f"waypoint entries of up to {np.abs(data).max():g} over {duration:g} s"
         )
-    return found
 
 
 def _apart(times: list[float], relative: tuple[float, ...], duration: float) -> Array | None:
@@ -389,7 +396,8 @@ def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
     jets = [w.jet for w in waypoints]
     sizes = list(map(len, jets))
     if len(set(sizes)) == 1 and all([w.complete for w in waypoints]):
-        return np.array(jets), [(tuple(range(sizes[0])),) * len(sizes)] * waypoints[0].naxes
+        table = joined(jets).reshape(len(jets), *jets[0].shape)
+        return table, [(tuple(range(sizes[0])),) * len(sizes)] * waypoints[0].naxes
     table = np.full((len(jets), max(sizes), jets[0].shape[1]), np.nan)
     for row, jet in zip(table, jets, strict=True):
         row[: len(jet)] = jet

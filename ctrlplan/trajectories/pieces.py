@@ -47,7 +47,7 @@ class Run(Fields):
 
     def __init__(self, system: NewtonSystem, first: int, coefficients: Array) -> None:
         last = first + coefficients.shape[2]
-        self._set_fields(system=system, first=first, last=last, coefficients=readonly(coefficients))
+        self._fill(system=system, first=first, last=last, coefficients=readonly(coefficients))
 
 
 class Pieces(Fields):
@@ -65,7 +65,7 @@ class Pieces(Fields):
     runs: tuple[Run, ...]
 
     def __init__(self, axes: Sequence[int], runs: Sequence[Run]) -> None:
-        self._set_fields(axes=tuple(axes), runs=tuple(runs))
+        self._fill(axes=tuple(axes), runs=tuple(runs))
 
     def run(self, segment: int) -> Run:
         """Run that contains a segment."""

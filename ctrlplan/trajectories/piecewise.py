@@ -35,6 +35,18 @@ from ctrlplan.trajectories.waypoint_spline import (
     same_times,
 )
 
+_ROOM = 0.5 * (MAXIMUM_SWING - 1.0)
+"""Range of what is added to the way from position to position, relative to theirs, that is no swing."""
+
+_FEW_POSITIONS = 40
+"""Number of positions up to which their ranges are faster without arrays."""
+
+_MANY_POSITIONS = 128
+"""Number of positions above which the squares of all coefficients bound too little."""
+
+_TINY = 1e-100
+"""Root of a sum of squares below which they may have lost digits."""
+
 _EXTREME = 200.0
 """Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
 
@@ -256,7 +268,7 @@ class PiecewiseSpline(WaypointSpline):
             frame = Frame(alpha, entries.times, period, unknown)
             names = checked_labels(labels or entries.labels, entries.table.shape[2])
         filled, pieces = frame.fitted(entries.rows)
-        self._set_fields(
+        self._fill(
             alpha=alpha,
             labels=names,
             breakpoints=frame.breakpoints,
@@ -392,11 +404,10 @@ class PiecewiseSpline(WaypointSpline):
         if self.alpha > math.pi:
             return False
         positions = self._entries.rows[:, 0]
-        lowest, highest = np.minimum.reduce(positions, axis=1), np.maximum.reduce(positions, axis=1)
-        allowed = 0.5 * (MAXIMUM_SWING - 1.0) * (highest - lowest)
-        limits = allowed.tolist()
+        spans = _spans(positions)
+        if positions.size <= _MANY_POSITIONS and self._is_small(spans):
+            return True
         for pieces in self._pieces:
-            axes = list(pieces.axes)
             for run in pieces.runs:
                 if not run.system.hermite:
                     return False
@@ -404,15 +415,42 @@ class PiecewiseSpline(WaypointSpline):
                 if not weights.size:
                     continue
                 sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
-                bounds = (weights @ sizes).reshape(len(axes), -1)
-                highest_bounds = np.maximum.reduce(bounds, axis=1).tolist()
-                if all([bound <= limits[axis] for axis, bound in zip(axes, highest_bounds, strict=True)]):
+                bounds = (weights @ sizes).reshape(len(pieces.axes), -1)
+                highest = np.maximum.reduce(bounds, axis=1).tolist()
+                if all([bound <= _ROOM * spans[axis] for axis, bound in zip(pieces.axes, highest, strict=True)]):
                     continue
-                near = (bounds <= allowed[axes, None]).all(axis=0)
-                low, high = _range(run, np.flatnonzero(~near))
-                if not ((low >= (lowest - allowed)[axes]) & (high <= (highest + allowed)[axes])).all():
+                if not self._values_stay_near(run, list(pieces.axes), bounds):
                     return False
         return True
+
+    def _values_stay_near(self, run: Run, axes: list[int], bounds: Array) -> bool:
+        """The same by values where the bounds (naxes, nsegments) of what is added are too large."""
+        positions = self._entries.rows[axes, 0]
+        lowest, highest = np.minimum.reduce(positions, axis=1), np.maximum.reduce(positions, axis=1)
+        allowed = _ROOM * (highest - lowest)
+        near = (bounds <= allowed[:, None]).all(axis=0)
+        low, high = _range(run, np.flatnonzero(~near))
+        return bool(((low >= lowest - allowed) & (high <= highest + allowed)).all())
+
+    def _is_small(self, spans: list[float]) -> bool:
+        """Whether the coefficients of all axes and segments together are small next to the range of each axis.
+
+        What the other functions of a segment add to the way from position to position
+        goes up and down by at most the sum of their ranges in all. By Schwarz's
+        inequality the root of all squares bounds that of one segment, and with the root
+        of 2 that of two segments, one of which may go up and the other one down.
+        """
+        bound = 0.0
+        for pieces in self._pieces:
+            for run in pieces.runs:
+                if not run.system.hermite:
+                    return False
+                flat = run.coefficients[2:].ravel()
+                bound = max(bound, run.system.higher_norm * math.sqrt(flat.dot(flat)))
+        if not bound > _TINY:  # squares may have underflowed
+            return False
+        room = 2.0 * _ROOM if self.breakpoints.size == 2 else _ROOM * math.sqrt(2.0)
+        return all([bound <= room * span for span in spans])
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
@@ -596,6 +634,15 @@ class PiecewiseSpline(WaypointSpline):
         return [*super()._facts(), alpha, ("period", "" if self._period is None else f"{number(self._period)} s")]
 
 
+def _spans(positions: Array) -> list[float]:
+    """Ranges of positions (naxes, nwaypoints) that are prescribed, not above 0 if one is free."""
+    if positions.size > _FEW_POSITIONS:
+        found: list[float] = (np.maximum.reduce(positions, axis=1) - np.minimum.reduce(positions, axis=1)).tolist()
+        return found
+    # The sum is nan if a position is free.
+    return [max(own) - min(own) if sum(own) < math.inf else 0.0 for own in positions.tolist()]
+
+
 def _range(run: Run, segments: slice | NDArray[np.intp]) -> tuple[Array, Array]:
     """Minimum and maximum (naxes,) in some segments of a run, on a grid."""
     coefficients = run.coefficients[:, :, segments]
@@ -631,6 +678,7 @@ def _entries_of(times: Array, values: ArrayLike, derivatives: Mapping[int, Array
     highest = max(orders, default=0)
     rows = np.empty((len(by_axis), 1 + highest, times.size))
     rows[:, 0] = by_axis
+    finite = are_finite(by_axis) or not np.isinf(by_axis).any()
     if len(orders) < highest:
         rows[:, 1:] = np.nan
     for order, given in orders.items():
@@ -641,7 +689,8 @@ def _entries_of(times: Array, values: ArrayLike, derivatives: Mapping[int, Array
                 f"got {row.shape}"
             )
         rows[:, order] = row
-    if not are_finite(rows) and np.isinf(rows).any():
+        finite = finite and (are_finite(row) or not np.isinf(row).any())
+    if not finite:
         i, order, axis = np.argwhere(np.isinf(rows.T))[0].tolist()
         name = f"derivatives[{order}]" if order else "values"
         raise ValueError(f"{name} must be finite or nan (free), got {rows[axis, order, i]} at times[{i}], axis {axis}")

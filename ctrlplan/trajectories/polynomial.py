@@ -74,8 +74,8 @@ class PolySpline(NewtonSpline):
         warn: bool = True,
     ) -> None:
         chosen = SplineOptions(labels, None, *checked_degree(degree, smooth), warn=warn)
-        self._fit(checked_waypoints(waypoints), 0.0, chosen)
-        self._check_swing()
+        if not self._fit(checked_waypoints(waypoints), 0.0, chosen):
+            self._check_swing()
 
     def stationary_places(self, nu: int) -> Places | None:
         """Places of the stationary points at moderate degrees; as `Trajectory.stationary_places`."""

@@ -93,8 +93,8 @@ class TrigSpline(NewtonSpline):
             labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), warn=warn
         )
         options = chosen.given() if isinstance(alpha, str) else {}
-        self._fit(points, chosen_alpha(alpha, points, type(self), **options), chosen)
-        self._check_swing()
+        if not self._fit(points, chosen_alpha(alpha, points, type(self), **options), chosen):
+            self._check_swing()
 
     @classmethod
     def cyclic(
@@ -134,8 +134,8 @@ class TrigSpline(NewtonSpline):
             labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), duration, warn
         )
         plan = cls.__new__(cls)
-        plan._fit(points, 2.0 * math.pi, chosen)
-        plan._check_swing()
+        if not plan._fit(points, 2.0 * math.pi, chosen):
+            plan._check_swing()
         return plan
 
     @property

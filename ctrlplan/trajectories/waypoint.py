@@ -144,15 +144,8 @@ class Waypoint(Displayed, Fields):
     def _of_checked(cls, time: float, jet: Array, labels: tuple[str, ...] | None, complete: bool) -> Waypoint:
         """Waypoint from a read-only array without infinite values; as `from_array`, without checks."""
         self = cls.__new__(cls)
-        self._keep(time, jet, labels, complete)
+        self._fill(time=time, jet=jet, labels=labels, complete=complete, naxes=jet.shape[1])
         return self
-
-    def _keep(self, time: float, jet: Array, labels: tuple[str, ...] | None, complete: bool) -> None:
-        """Set the fields of a new waypoint without the checks of `_set_fields`; plans read many waypoints."""
-        values = {"time": time, "jet": jet, "labels": labels, "complete": complete, "naxes": jet.shape[1]}
-        if self.__dict__:
-            self._set_fields(**values)  # raises: it is not new
-        self.__dict__.update(values)
 
     def _set(self, time: float, jet: Array, labels: tuple[str, ...] | None) -> None:
         complete = are_finite(jet) or bool(np.isfinite(jet).all())
@@ -160,7 +153,7 @@ class Waypoint(Displayed, Fields):
             order, axis = np.argwhere(np.isinf(jet))[0]
             name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
             raise ValueError(f"{name} must be finite or nan (free), got {jet[order, axis]} at time {time:g}")
-        self._keep(time, readonly(jet), labels, complete)
+        self._fill(time=time, jet=readonly(jet), labels=labels, complete=complete, naxes=jet.shape[1])
 
     @property
     def position(self) -> Array:
@@ -277,17 +270,12 @@ class Entries:
         jets = [point.jet for point in waypoints]
         sizes = list(map(len, jets))
         rows, naxes = max(sizes), jets[0].shape[1]
-        try:
-            # A quarter of the time of np.concatenate.
-            joined = np.frombuffer(b"".join(cast("Sequence[bytes]", jets))).reshape(-1, naxes)
-        except TypeError:  # not contiguous: parts of a larger table
-            joined = np.concatenate(jets)
-        counts = np.array(sizes)
+        counts, entries = np.array(sizes), joined(jets)
         if min(sizes) == rows:
-            table = joined.reshape(-1, rows, naxes)
+            table = entries.reshape(-1, rows, naxes)
         else:
             table = np.full((len(jets), rows, naxes), np.nan)
-            table[np.arange(rows) < counts[:, None]] = joined
+            table[np.arange(rows) < counts[:, None]] = entries.reshape(-1, naxes)
         times = readonly(np.fromiter([point.time for point in waypoints], float, len(jets)))
         return cls(times, readonly(table), counts, waypoints[0].labels)
 
@@ -341,6 +329,15 @@ class Entries:
         if np.isinf(self.table).any():
             return tuple(Waypoint.from_array(time, jet, self.labels) for time, jet, _ in cells)
         return tuple(Waypoint._of_checked(time, jet, self.labels, whole) for time, jet, whole in cells)
+
+
+def joined(jets: Sequence[Array]) -> Array:
+    """Entries of all jets, one after the other, in one row."""
+    try:
+        # A quarter of the time of np.concatenate.
+        return np.frombuffer(b"".join(cast("Sequence[bytes]", jets)))
+    except TypeError:  # not contiguous: parts of a larger table
+        return np.concatenate([jet.ravel() for jet in jets])
 
 
 def waypoint_table(waypoints: Sequence[Waypoint], labels: Sequence[str]) -> Table:
