@@ -408,8 +408,8 @@ class Smooth:
         before, flat, after = (np.abs(slope.take(outer + shift)) for shift in range(3))
         steep = flat > _JUMP * np.maximum(before, after)
         samples = f[rows, k + 1], f[rows, k + 2], f[rows, k + 3]
-        curvatures = d.take(inner), d.take(inner + 1)
-        return begin + rows, k, smooth.take(here), third.take(here), *_neighbours(third, at), *curvatures, *samples, steep
+        thirds = third.take(here), *_neighbours(third, at)
+        return begin + rows, k, smooth.take(here), *thirds, d.take(inner), d.take(inner + 1), *samples, steep
 
     def pieces(self, near: Near) -> Pieces:
         """Return the cubics of signals on their inner intervals."""
