@@ -164,13 +164,15 @@ def _online(options: argparse.Namespace) -> list[Path]:
 
 def _all_of(studies: Mapping[str, Callable[..., Study]], folder: Path, title: str) -> list[Path]:
     from ctrlplan.reports import write_report
+    from ctrlplan.simulation.built_forms import shared_forms
     from ctrlplan.studies.progress import bars_over_plans
 
     found = []
-    for i, (name, study) in enumerate(studies.items()):
-        _print_status(f"running study {name} ({i + 1} of {len(studies)})")
-        with bars_over_plans(sys.stderr.isatty()):
-            found.append(study(progress=sys.stderr.isatty()))
+    with shared_forms():  # studies of one plant have equal loops
+        for i, (name, study) in enumerate(studies.items()):
+            _print_status(f"running study {name} ({i + 1} of {len(studies)})")
+            with bars_over_plans(sys.stderr.isatty()):
+                found.append(study(progress=sys.stderr.isatty()))
     _print_status("writing the report")
     return write_report(found, folder, title)
 

@@ -404,9 +404,12 @@ class Smooth:
         """
         slope, d, third, smooth = found
         rows, k = at
-        steep = np.abs(slope[rows, k + 1]) > _JUMP * np.maximum(np.abs(slope[rows, k]), np.abs(slope[rows, k + 2]))
+        here, inner, outer = (rows * values.shape[1] + k for values in (third, d, slope))
+        before, flat, after = (np.abs(slope.take(outer + shift)) for shift in range(3))
+        steep = flat > _JUMP * np.maximum(before, after)
         samples = f[rows, k + 1], f[rows, k + 2], f[rows, k + 3]
-        return begin + rows, k, smooth[at], third[at], *_neighbours(third, at), d[at], d[rows, k + 1], *samples, steep
+        thirds = third.take(here), *_neighbours(third, at)
+        return begin + rows, k, smooth.take(here), *thirds, d.take(inner), d.take(inner + 1), *samples, steep
 
     def pieces(self, near: Near) -> Pieces:
         """Return the cubics of signals on their inner intervals."""
@@ -447,7 +450,7 @@ class _SquareForm(Smooth):
         found, near = np.empty(len(f)), list[Near]()
         for some in row_blocks(f):
             differences = self.differences(f[some])
-            near.append(self.near(f[some], differences, np.nonzero(~differences[3]), some.start))
+            near.append(self.near(f[some], differences, places(~differences[3]), some.start))
         for i, row in enumerate(f):  # a row has the same sum with others in the same call
             found[i] = sum(band @ (row[: band.size] * row[row.size - band.size :]) for band in self._bands)
         columns = together(near)
@@ -471,6 +474,11 @@ def _bent(base: Array, third: Array, early: Array, step: Array) -> tuple[Array, 
     square = step * step
     d = third * (square * step)
     return (base + early * third) * square - d, d
+
+
+def places(chosen: NDArray[np.bool_]) -> Places:
+    """Return the rows and columns of the few true entries of an array (nrows, ncolumns)."""
+    return tuple(np.divmod(np.flatnonzero(chosen), chosen.shape[1]))
 
 
 def together(near: Sequence[Near]) -> Near:
@@ -579,6 +587,9 @@ def _neighbours(third: Array, at: tuple[NDArray[np.intp], ...]) -> tuple[Array, 
     *rows, k = at
     last = third.shape[-1] - 1
     before, after = np.where(k > 0, k - 1, min(2, last)), np.where(k < last, k + 1, max(last - 2, 0))
+    if len(rows) == 1 and third.flags.c_contiguous:
+        first = rows[0] * (last + 1)
+        return third.take(first + before), third.take(first + after)
     return third[*rows, before], third[*rows, after]
 
 

@@ -80,8 +80,9 @@ def plan_length(plan: Trajectory) -> float:
     --------
     ctrlplan.metrics.path_length : Path length from samples.
     """
-    length = _variation if plan.naxes == 1 else _arc
-    return sum(length(plan, left, right) for left, right in pairwise(plan.breakpoints.tolist()))
+    if plan.naxes > 1:
+        return _arc(plan)
+    return sum(_variation(plan, left, right) for left, right in pairwise(plan.breakpoints.tolist()))
 
 
 @of_size(1.0)
@@ -104,6 +105,10 @@ def plan_excess_length(plan: Trajectory) -> float:
 
 
 _GRADED = np.array([0.0, *0.1 ** np.arange(4.0)[::-1]])[:, None]
+"""Ends of the finer panels on either side of a minimum of the speed."""
+
+_NODES, _PANELS = 16, np.linspace(0.0, 1.0, 13)
+"""Number of nodes of a panel, and ends of the panels of a segment."""
 
 
 @dataclass(frozen=True)
@@ -202,19 +207,23 @@ def checked_objective(objective: ObjectiveName | Objective) -> Objective:
     return objective
 
 
-def _arc(plan: Trajectory, left: float, right: float) -> float:
-    """Length of one segment by quadrature on panels, graded towards the minimum of the speed where it is near 0."""
-    nodes, weights = gauss(16)
-    edges = np.linspace(left, right, 13)
-    squares = _squares(plan, edges[:-1], edges[1:])
+def _arc(plan: Trajectory) -> float:
+    """Length by quadrature on panels of each segment, graded towards the minimum of the speed where it is near 0."""
+    nodes, weights = gauss(_NODES)
+    left, right = plan.breakpoints[:-1], plan.breakpoints[1:]
+    edges = left[:, None] + (right - left)[:, None] * _PANELS
+    low, high = edges[:, :-1].ravel(), edges[:, 1:].ravel()
+    squares = _squares(plan, low, high)
     speed = np.sqrt(squares)
-    lengths = np.diff(edges) * (speed @ weights)
-    rough = (right - left) / 12 * np.abs(speed @ _last_legendre(16)).max(axis=1) > 3e-7 * lengths.sum()
+    lengths = ((high - low) * (speed @ weights)).reshape(left.size, _PANELS.size - 1)
+    last = np.abs(speed @ _last_legendre(_NODES)).max(axis=1)
+    rough = ((high - low) * last).reshape(lengths.shape) > 3e-7 * lengths.sum(axis=1, keepdims=True)
     if not rough.any():
         return float(lengths.sum())
-    slowest = np.clip(np.argmin(squares[rough], axis=1), 1, 14)[:, None] + np.array([-1, 0, 1])
-    low, high = edges[:-1][rough], edges[1:][rough]
-    minimum = low + (high - low) * _vertex(nodes[slowest], np.take_along_axis(squares[rough], slowest, axis=1))
+    panels = rough.ravel()
+    low, high, squares = low[panels], high[panels], squares[panels]
+    slowest = np.clip(np.argmin(squares, axis=1), 1, _NODES - 2)[:, None] + np.array([-1, 0, 1])
+    minimum = low + (high - low) * _vertex(nodes[slowest], np.take_along_axis(squares, slowest, axis=1))
     minimum = np.clip(minimum, low, high)
     parts = np.concatenate([minimum + (end - minimum) * share for end in (low, high) for share in _GRADED])
     begin, end = parts.reshape(2, len(_GRADED), -1)[:, :-1], parts.reshape(2, len(_GRADED), -1)[:, 1:]
@@ -246,7 +255,7 @@ def _crossings(plan: Trajectory, t: Array, nu: int) -> Array:
 
 def _squares(plan: Trajectory, begin: Array, end: Array) -> Array:
     """Squared speed (npanels, 16) at the Gauss points of panels."""
-    rates = plan.jet(begin[:, None] + (end - begin)[:, None] * gauss(16)[0], 1)[1]
+    rates = plan.jet(begin[:, None] + (end - begin)[:, None] * gauss(_NODES)[0], 1)[1]
     return np.einsum("apt,apt->pt", rates, rates)
 
 

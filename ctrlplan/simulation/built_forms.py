@@ -67,19 +67,49 @@ def shared_forms() -> Iterator[None]:
     """Compile loops with equal blocks and connections once in a context, as those of several plans.
 
     A loop that differs in its sources and in the times, states and parameters of
-    its runs has the same equations. Contexts inside another one share its forms.
+    its runs has the same equations. If a run of them has to be repeated with closer
+    tolerances, later ones begin with these. Contexts inside another one share its forms.
     """
     if _SHARED.get() is not None:
         yield
         return
-    token = _SHARED.set(Lru(_CACHE_SIZE))
+    token = _SHARED.set(_Shared())
     try:
         yield
     finally:
         _SHARED.reset(token)
 
 
-_SHARED: ContextVar[Lru[tuple[object, ...], BuiltForm] | None] = ContextVar("shared", default=None)
+class _Shared:
+    """What a context of `shared_forms` keeps.
+
+    Attributes
+    ----------
+    forms : Lru
+        Compiled forms by structure.
+    close : set of (Compiled, float)
+        Forms and relative tolerances of runs that were repeated with closer states.
+    """
+
+    def __init__(self) -> None:
+        self.forms: Lru[tuple[object, ...], BuiltForm] = Lru(_CACHE_SIZE)
+        self.close: set[tuple[Compiled, float]] = set()
+
+
+_SHARED: ContextVar[_Shared | None] = ContextVar("shared", default=None)
+
+
+def expects_closer_states(form: Compiled, rtol: float) -> bool:
+    """Whether a run of a form was repeated with closer states before, in this context of `shared_forms`."""
+    shared = _SHARED.get()
+    return shared is not None and (form, rtol) in shared.close
+
+
+def expect_closer_states(form: Compiled, rtol: float) -> None:
+    """Let later runs of a form begin with closer states, in a context of `shared_forms`."""
+    shared = _SHARED.get()
+    if shared is not None:
+        shared.close.add((form, rtol))
 
 
 def built_once(structure: Callable[[], tuple[object, ...] | None], build: Callable[[], BuiltForm]) -> BuiltForm:
@@ -89,7 +119,7 @@ def built_once(structure: Callable[[], tuple[object, ...] | None], build: Callab
     if shared is None or key is None:
         return build()
     try:
-        return shared.get(key, lambda: _compiled(build()))
+        return shared.forms.get(key, lambda: _compiled(build()))
     except _NotBuiltError as error:
         return error.form
 
@@ -143,7 +173,7 @@ class BuiltForms:
         """Discard a wrong form; it may be rebuilt once, since its functions may have changed."""
         shared = _SHARED.get()
         if shared is not None:
-            shared.clear()
+            shared.forms.clear()
         with BUILDING:
             retained = []
             for entry in self.forms:

@@ -165,10 +165,11 @@ class Compiled:
         self._patterns: Lru[tuple[float, ...], tuple[Array, Pattern]] = Lru(_CACHE_SIZE)
         self._steps: Lru[tuple[int, int, bool, bool], OneStep | None] = Lru(_CACHE_SIZE)
         self._equations: dict[tuple[int, bool, bool], dict[str, ca.SX]] = {}
+        self._functions_of_segments: dict[tuple[int, bool, bool], ca.Function] = {}
 
     def __getstate__(self) -> dict[str, object]:
         """State without what can be rebuilt."""
-        return self.__dict__ | {"_traces": [], "_equations": {}}
+        return self.__dict__ | {"_traces": [], "_equations": {}, "_functions_of_segments": {}}
 
     def parameters(self, params: Params) -> Array:
         """Vector p for the parameters of a run."""
@@ -289,10 +290,20 @@ class Compiled:
             "disable_internal_warnings": True,
         }
         grid = np.frombuffer(settings.grid).tolist()
-        equations = self._segment_equations(settings.width, settings.harmonic, settings.scaled)
         with passing_interruptions():
+            equations = self._function_of_segments(settings.width, settings.harmonic, settings.scaled)
             made = ca.integrator("segment", "cvodes", equations, 0.0, grid, options)
         return Segment(made, self.moving.size)
+
+    def _function_of_segments(self, width: int, harmonic: bool, scaled: bool) -> ca.Function:
+        """The equations of a segment as a function, whose derivatives CasADi keeps for all integrators."""
+        key = width, harmonic, scaled
+        if key not in self._functions_of_segments:
+            equations = self._segment_equations(width, harmonic, scaled)
+            inputs = [equations.get(name, ca.SX(0, 1)) for name in ca.dyn_in()]
+            results = [equations.get(name, ca.SX(0, 1)) for name in ca.dyn_out()]
+            self._functions_of_segments[key] = ca.Function("segment", inputs, results, ca.dyn_in(), ca.dyn_out())
+        return self._functions_of_segments[key]
 
     def _at_many(self, name: str, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         function = self._functions[name]

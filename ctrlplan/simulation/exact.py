@@ -277,7 +277,7 @@ def _even_segment(
     main = out[:, :, : whole * per].reshape(*out.shape[:2], whole, per)
     np.matmul(known[:, None, :whole], rows, out=main)
     out[:, :, whole * per :] = (known[:, None, whole : whole + 1] @ rows[..., :remainder])[:, :, 0]
-    for i in np.flatnonzero(~np.isfinite(out).all(axis=(1, 2))):
+    for i in _overflowed(out):
         main[i] = matrix_product(known[i, :whole], rows[i])
         out[i, :, whole * per :] = matrix_product(known[i, whole : whole + 1], rows[i, ..., :remainder])[:, 0]
     if samples[-1] == duration:
@@ -522,12 +522,19 @@ def _marched(state: Array, changes: list[Array], series: Array) -> Array:
         state = state + ((change @ state[:, :, None])[:, :, 0] + forced[k])
         rows[k + 1] = state
     states = np.moveaxis(rows, 0, 2)
-    for i, found in enumerate(states):
+    for i in _overflowed(states):
+        found = states[i]
         for k in range(_first_overflow(found), ncells + 1):
             if k:
                 before, terms = found[:, k - 1, None], series[:, :, k - 1, None]
                 found[:, k] = _propagated(before, terms, [change[i] for change in changes])[:, 0]
     return states
+
+
+def _overflowed(values: Array) -> list[int]:
+    """Indices of the systems whose values (nsystems, nrows, ntime) are not all finite."""
+    suspect = np.flatnonzero(~np.isfinite(values.sum(axis=(1, 2))))  # a sum overflows more easily
+    return [i for i in suspect.tolist() if not np.isfinite(values[i]).all()]
 
 
 def _first_overflow(states: Array) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from typing import Generic, Protocol, TypeVar
@@ -106,12 +107,18 @@ class NumericalMethod(Protocol[S]):
     def check(self, attempt: Attempt[S]) -> None:
         """Raise if the result of an attempt is not valid."""
 
+    def expects_closer_states(self, attempt: Attempt[S]) -> bool:
+        """Whether a run of the same equations had to be repeated with closer states."""
+
+    def expect_closer_states(self, attempt: Attempt[S]) -> None:
+        """Note that an attempt had to be repeated with closer states."""
+
 
 def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     """Record of a numerical run, repeated with the scales of the states and if its accuracy requires it."""
-    scales, fresh = Scales.plain(job.state.size, job.atol), fresh_job(job)
-    attempt = Attempt(job, method, scales)
-    attempt.go()
+    fresh = fresh_job(job)
+    attempt = _first(job, method)
+    scales = attempt.scales
     for _ in range(PASSES - 1 if job.atol is None else 0):
         found = scales.renewed(attempt.hull, attempt.moving, attempt.noise, attempt.passed_on)
         if found is None:
@@ -127,6 +134,18 @@ def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     if attempt.tighter == 1.0:
         attempt = _with_closer_states(attempt, fresh)
     return attempt.record()
+
+
+def _first(job: Job, method: NumericalMethod[S]) -> Attempt[S]:
+    """First run, with closer states if those of the same equations required them before."""
+    attempt = Attempt(job, method, Scales.plain(job.state.size, job.atol))
+    if method.expects_closer_states(attempt):
+        closer = Attempt(fresh_job(job), method, attempt.scales.closer())
+        with suppress(SolverError):
+            closer.go()
+            return closer
+    attempt.go()
+    return attempt
 
 
 def _tightened(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
@@ -164,6 +183,7 @@ def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
     loose = attempt.loose()
     if not loose.any():
         return attempt
+    attempt.method.expect_closer_states(attempt)
     try:
         scales = attempt.scales.with_closer_states(
             attempt.hull,

@@ -168,6 +168,10 @@ class Scales:
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
         return _ADDED * (rtol * self.relative * size + self.atol * self.scale)
 
+    def closer(self) -> Scales:
+        """Scales with the smaller relative tolerance for all states."""
+        return replace(self, relative=np.full_like(self.relative, _CLOSER))
+
     def with_closer_states(
         self, states: Array, loose: NDArray[np.bool_], noise: Array, evaluations: int | None
     ) -> Scales:

@@ -165,9 +165,11 @@ def _outputs(form: LinearForm, rows: list[int], plan: Trajectory, times: Array, 
     """Some of the outputs, shape (nloops, nrows, ntime), with a plan at the inputs."""
     with np.errstate(over="ignore", invalid="ignore"):
         out = exact_states(form.a, form.b, plan.segment_jet_at, list(plan.breakpoints), times, initial, form.c[:, rows])
-        for k, row in enumerate(rows):
-            if form.d[:, row].any():
-                out[:, k] += form.d[:, row] @ plan.jet(times, 0)[0]
+        direct = form.d[:, rows]
+        if direct.any():
+            reference = plan.jet(times, 0)[0]
+            for i, k, j in np.argwhere(direct).tolist():  # row by row, which stays in the cache
+                out[i, k] += direct[i, k, j] * reference[j]
     if not np.isfinite(out[..., -1]).all():  # after an overflow
         out[np.isnan(out)] = np.inf
     return out

@@ -9,6 +9,7 @@ import numpy as np
 
 from ctrlplan import metrics
 from ctrlplan._types import Array
+from ctrlplan.planning import plan_length
 from ctrlplan.simulation import Event
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.measures import Measure, signals_of
@@ -97,7 +98,6 @@ def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -
     load = np.stack([signals["x"], signals["z"]])
     error = np.hypot(*(load - plan.jet(t, 0)[0]))
     during, after = t <= last, t >= last
-    travelled = None if plan.jumps(0) else plan.jet(np.linspace(plan.start, plan.end, 4001), 0)[0]
     lasts = t.size > 1  # a run that an event ends at its first sample has integrals of 0
     slack = float(metrics.saturation_time(t, signals["T"], 0.0, np.inf)) if lasts else 0.0
     return {
@@ -108,9 +108,7 @@ def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -
         "slack_time": slack
         if slack > 1e-9 * (t[-1] - t[0])
         else 0.0,  # at the event itself the tension is 0 up to rounding
-        "path_length": np.nan
-        if travelled is None
-        else float(metrics.path_length(np.linspace(plan.start, plan.end, 4001), travelled)),
+        "path_length": np.nan if plan.jumps(0) else plan_length(plan),
         "load_path": float(metrics.path_length(t, load)) if lasts else 0.0,
     }
 

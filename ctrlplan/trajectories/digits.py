@@ -12,6 +12,7 @@ import decimal
 import math
 from collections.abc import Sequence
 from decimal import Decimal
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -58,9 +59,10 @@ def many_digits(
     with decimal.localcontext(decimal.Context(digits + 40, Emin=decimal.MIN_EMIN, Emax=decimal.MAX_EMAX)):
         span = Decimal(duration)
         u = [(Decimal(t) - Decimal(times[0])) / span for t in times]
-        nodes = [u[i] for i in where]
+        nodes = tuple(u[i] for i in where)
         highest = {i: max(k for j, k in zip(where, orders, strict=True) if j == i) for i in set(where)}
-        bases = {i: basis_series(Decimal(alpha), u[i], nodes, order, Decimal(fold)) for i, order in highest.items()}
+        given = Decimal(alpha), nodes, Decimal(fold), digits
+        bases = {i: _known_series(u[i], order, *given) for i, order in highest.items()}
         columns: list[list[Decimal]] = [[] for _ in range(values.shape[1])]
         for row, (i, k) in enumerate(zip(where, orders, strict=True)):
             line = [series[k] for series in bases[i][: row + 1]]
@@ -71,7 +73,15 @@ def many_digits(
         return np.array([[float(value) for value in column] for column in columns]).T
 
 
-def basis_series(alpha: Decimal, u: Decimal, nodes: list[Decimal], order: int, fold: Decimal) -> list[Series]:
+@lru_cache(maxsize=16)
+def _known_series(
+    u: Decimal, order: int, alpha: Decimal, nodes: tuple[Decimal, ...], fold: Decimal, digits: int
+) -> list[Series]:
+    """Series of the basis, computed once for segments of equal relative times; `digits` are those of the context."""
+    return basis_series(alpha, u, nodes, order, fold)
+
+
+def basis_series(alpha: Decimal, u: Decimal, nodes: Sequence[Decimal], order: int, fold: Decimal) -> list[Series]:
     """Taylor series about u of the functions of `newton`, pair by pair of nodes, in the context's digits."""
     found = [[Decimal(1), *[Decimal(0)] * order]]
     for first, second in zip(nodes[::2], nodes[1::2], strict=False):

@@ -1,6 +1,7 @@
 """Loops that differ in their sources only are compiled once in a context of `shared_forms`."""
 
 import math
+from contextlib import nullcontext
 from itertools import pairwise
 
 import control as ct
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
-from ctrlplan.simulation import compiled
+from ctrlplan.simulation import compiled, numerical
 from ctrlplan.simulation.built_forms import NotApplicableError, shared_forms
 from ctrlplan.simulation.job import with_event_times
 
@@ -125,3 +126,46 @@ def test_times_of_events_divide_the_intervals_of_samples():
             np.testing.assert_allclose(np.diff(inside), (right - left) / (inside.size - 1), rtol=1e-9)
     dense = np.linspace(0.0, 1.0, 2001)
     assert with_event_times(dense, event, lambda: np.zeros((1, 1))) is dense
+
+
+TURNS = 1e4
+"""Angle of `turning` after 1 s of the plan at 1 [rad]."""
+
+
+def turning(distance):
+    """An angle of thousands of turns and the integral of its cosine, with the plan of the rate inside."""
+
+    def update(t, x, u, params):
+        return [TURNS * u[0], np.cos(x[0])]
+
+    def output(t, x, u, params):
+        return [x[1]]
+
+    block = ct.nlsys(update, output, inputs=["r"], outputs=["y"], states=["phi", "y"], name="turning")
+    points = [cp.Waypoint(0.0, 0.0, 0.0, 0.0), cp.Waypoint(1.0, distance, 0.0, 0.0)]
+    source = cp.create_source_iosystem(cp.PolySpline(points, labels=["r"]), name="plan")
+    return ct.interconnect([source, block], inputs=0, outputs=["y"])
+
+
+def integral_of_cosine(distance, times):
+    """The last state of `turning` in closed form but for one integral, by 20 Gauss points in each 1/8000 s."""
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    edges = np.linspace(0.0, 1.0, 8001)
+    t = edges[:-1, None] + np.diff(edges)[:, None] * (nodes + 1.0) / 2.0
+    angle = TURNS * distance * t**4 * (2.5 - 3.0 * t + t**2)
+    total = np.concatenate([[0.0], np.cumsum(np.cos(angle) @ weights / 2.0 * np.diff(edges))])
+    return np.interp(times, edges, total)
+
+
+def test_a_run_begins_with_the_tolerances_that_one_of_an_equal_loop_required(monkeypatch):
+    runs, go = [], numerical.Attempt.go
+    monkeypatch.setattr(numerical.Attempt, "go", lambda self: runs.append(self) or go(self))
+    times, counts = np.linspace(0.0, 1.0, 41), []
+    for context in (shared_forms, nullcontext):
+        with context():
+            for distance in (1.0, 0.75):
+                runs.clear()
+                found = cp.simulate(turning(distance), times, method="compiled")
+                counts.append(len(runs))
+                assert np.abs(found.outputs - integral_of_cosine(distance, times)).max() <= 1e-7
+    assert counts == [2, 1, 2, 2]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctrlplan._types import Array
-from ctrlplan.simulation.built_forms import DisagreementError
+from ctrlplan.simulation.built_forms import DisagreementError, expect_closer_states, expects_closer_states
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.interruptions import passing_interruptions
 from ctrlplan.simulation.job import Job, Record, fresh_job
@@ -80,6 +80,14 @@ class CompiledMethod:
         wrong = _disagreement(attempt, solver) if attempt.copies.blocks else ""
         if wrong:
             raise job.prepared.discard(solver.form, wrong)
+
+    def expects_closer_states(self, attempt: Attempt[CompiledSolver]) -> bool:
+        """Whether a run of an equal loop was repeated with closer states, as one of another plan in a study."""
+        return expects_closer_states(attempt.solver.form, attempt.job.rtol)
+
+    def expect_closer_states(self, attempt: Attempt[CompiledSolver]) -> None:
+        """Let later runs of equal loops begin with closer states."""
+        expect_closer_states(attempt.solver.form, attempt.job.rtol)
 
 
 def _disagreement(attempt: Attempt[CompiledSolver], solver: CompiledSolver) -> str:
