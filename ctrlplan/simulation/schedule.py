@@ -79,17 +79,18 @@ class Schedule:
         return self._growth
 
     def _new_steps(self) -> Steps:
-        form, moving, njumps = self._form, self._form.moving, len(self.jumps)
+        form, moving = self._form, self._form.moving
         kernel = FlowKernel(form.a[:, moving], form.a[:, self.held], np.zeros((moving.size, 0)), 0)
-        size = form.signals_z.shape[1]
-        flows = np.zeros((self.instants.lengths.size, moving.size, size))
+        size, nlengths = form.signals_z.shape[1], self.instants.lengths.size
+        flows = np.zeros((nlengths, moving.size, size))
         flows[:, :, np.concatenate([moving, self.held])] = kernel.over(self.instants.lengths)
-        pairs, kinds = np.unique(self.instants.which * njumps + self.due[1:], return_inverse=True)
-        lengths, jumps = np.divmod(pairs, njumps)
+        pairs, kinds = np.unique(self.due[1:] * nlengths + self.instants.which, return_inverse=True)
+        ends = np.searchsorted(pairs, nlengths * np.arange(len(self.jumps) + 1)).tolist()
         matrices = np.empty((pairs.size, size, size))
         for k, (jump, _) in enumerate(self.jumps):
-            own = np.flatnonzero(jumps == k)
-            matrices[own] = np.matmul(jump[:, moving], flows[lengths[own]]) + jump
+            own = matrices[ends[k] : ends[k + 1]]
+            np.matmul(jump[:, moving], flows[pairs[ends[k] : ends[k + 1]] - k * nlengths], out=own)
+            own += jump
         lines = (
             DelayLine(
                 line.count,
