@@ -34,6 +34,7 @@ from ctrlplan.simulation.segments import as_fraction
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.collocation import Collocation
+    from ctrlplan.simulation.hop_cells import HopCells
     from ctrlplan.simulation.schedule import Schedule
 
 Timing = tuple[Fraction, Fraction]
@@ -302,12 +303,16 @@ class DelayedForm:
         The flow of all states.
     lates : tuple of Late
         Delays; at least one.
+    marks, cells : Lru
+        Times at which the signals of the last runs are not smooth, and cells between them.
     """
 
     base: SampledForm
     a: Array
     b: Array
     lates: tuple[Late, ...]
+    marks: Lru[tuple[object, ...], Array | None] = field(default_factory=lambda: Lru(_SCHEDULES), init=False)
+    cells: Lru[tuple[object, ...], HopCells] = field(default_factory=lambda: Lru(_SCHEDULES), init=False)
 
     @cached_property
     def delayed(self) -> NDArray[np.intp]:
