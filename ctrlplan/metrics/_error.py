@@ -12,6 +12,7 @@ from ctrlplan.metrics._pieces import (
     gathered,
     once,
     pieces,
+    places,
     row_blocks,
     squares,
     together,
@@ -206,7 +207,7 @@ class _LongAreas:
             infinite = ~(np.abs(f[some]).max(axis=1) < HUGE)
             rows = np.where(infinite[:, None], 0.0, f[some]) if infinite.any() else f[some]
             slope, d, third, known = found = smooth.differences(rows)
-            others = np.nonzero(~(known & smooth.keeps_sign(rows, d)))
+            others = places(~(known & smooth.keeps_sign(rows, d)))
             near.append(smooth.near(rows, found, others, some.start))
             areas = weights[0] * (rows[:, 1:-2] + rows[:, 2:-1]) - weights[1] * d[:, :-1] - weights[2] * third
             moments = levers[0] * areas + levers[1] * slope[:, 1:-1] - levers[2] * third
