@@ -24,6 +24,7 @@ from functools import cached_property
 from typing import Any, TypeVar, cast
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ctrlplan._lru import Lru
@@ -229,8 +230,8 @@ class Bulges:
         step = np.diff(t)
         self._pace, self._width, self._share = 1.0 / step, 1.0 / (t[2:] - t[:-2]), step[1:-1] ** 2 / 4
         self._starts = np.arange(0, t.size, _STRETCH)
-        # Of four samples of magnitude 1: both curvatures are at most 2 / (product of the adjacent steps).
-        self._largest = 1.0 + 1e-9 + float((step[1:-1] / (2 * np.minimum(step[:-2], step[2:]))).max(initial=0.0))
+        # Of four samples in a range of 1: both curvatures are at most 1 / (product of the adjacent steps).
+        self._farthest = float((step[1:-1] / (4 * np.minimum(step[:-2], step[2:]))).max(initial=0.0))
 
     def extrema(self, f: Array) -> tuple[Array, Array]:
         """Return the minima and maxima of the samples of signals (nrows, ntime) by stretch, (nrows, nstretches)."""
@@ -253,7 +254,7 @@ class Bulges:
         f: Array,
         size: Callable[[Array], Array],
         level: Array,
-        peaks: Array,
+        extrema: tuple[Array, Array],
         first: NDArray[np.intp] | None = None,
     ) -> Places:
         """Return the intervals in which the cubics of signals, or their magnitudes, may exceed a level.
@@ -266,8 +267,8 @@ class Bulges:
             Returns signals, or their magnitudes: what is compared with the level.
         level : ndarray, shape (nrows,)
             The level of each signal; none of its intervals are returned if it is nan.
-        peaks : ndarray, shape (nrows, nstretches)
-            Magnitudes of the signals by stretch.
+        extrema : tuple of ndarray, shapes (nrows, nstretches)
+            Minima and maxima of the signals by stretch.
         first : ndarray, shape (nrows,), optional
             First interval of each signal; default: 0. It and the last one, with no bound, are included.
 
@@ -280,37 +281,60 @@ class Bulges:
         usable = np.flatnonzero(~np.isnan(level))
         found = [usable * ntime + first[usable], usable * ntime + ntime - 2]
         # Stretches of smaller samples are far below the level, also between samples; nan cannot be excluded.
-        large = ~(peaks * self._largest <= level[:, None]) & (self._starts + _STRETCH >= first[:, None])
-        rows, stretch = np.nonzero(large & ~np.isnan(level)[:, None])
+        large = ~(self._reach(size, extrema) <= level[:, None]) & (self._starts + _STRETCH >= first[:, None])
+        rows, stretch = places(large & (~np.isnan(level) & (ntime > 3))[:, None])
+        windows = self._windows(f) if rows.size else ()
         for begin in range(0, rows.size, _WINDOWS):
             own = rows[begin : begin + _WINDOWS]
-            window, interval = self._inside(f, size, level, own, stretch[begin : begin + _WINDOWS])
+            window, interval = self._inside(windows, size, level, own, stretch[begin : begin + _WINDOWS])
             late = interval > first[own[window]]
             found.append(own[window[late]] * ntime + interval[late])
         return tuple(np.divmod(np.unique(np.concatenate(found)), ntime))
 
+    def _reach(self, size: Callable[[Array], Array], extrema: tuple[Array, Array]) -> Array:
+        """Return bounds of signals, or of their magnitudes, by stretch, also between samples, (nrows, nstretches)."""
+        # The cubics of a stretch depend on samples of its neighbours.
+        low, high = (bound.copy() for bound in extrema)
+        for bound, given, nearer in ((low, extrema[0], np.minimum), (high, extrema[1], np.maximum)):
+            nearer(bound[:, 1:], given[:, :-1], out=bound[:, 1:])
+            nearer(bound[:, :-1], given[:, 1:], out=bound[:, :-1])
+        top = np.maximum(size(low), size(high))
+        return np.asarray(top + self._farthest * (high - low) + 1e-9 * np.maximum(-low, high))
+
+    def _windows(self, f: Array) -> tuple[Array, ...]:
+        """Return signals (nrows, nwindows, nsamples) and factors of their differences (nwindows, ...) in windows."""
+        count = min(f.shape[1], _STRETCH + 6)
+        factors = self._pace, self._width, self._share
+        return sliding_window_view(f, count, axis=1), *(
+            sliding_window_view(row, count - k) for k, row in enumerate(factors, 1)
+        )
+
     def _inside(
         self,
-        f: Array,
+        windows: tuple[Array, ...],
         size: Callable[[Array], Array],
         level: Array,
         rows: NDArray[np.intp],
         stretch: NDArray[np.intp],
     ) -> Places:
         """Return those of the inner intervals with samples of some stretches, with the number of the stretch first."""
-        count = min(f.shape[1], _STRETCH + 6)
-        at = np.clip(self._starts[stretch] - 3, 0, f.shape[1] - count)[:, None] + np.arange(count)
-        samples = f[rows[:, None], at]
+        first = np.clip(self._starts[stretch] - 3, 0, len(windows[1]) - 1)
+        samples, pace, width, share = windows[0][rows, first], *(factor[first] for factor in windows[1:])
         slope = samples[:, 1:] - samples[:, :-1]
-        slope *= self._pace[at[:, :-1]]
+        slope *= pace
         d = slope[:, 1:] - slope[:, :-1]
-        d *= self._width[at[:, :-2]]
+        d *= width
         np.abs(d, out=d)
         reach, sized = np.maximum(d[:, :-1], d[:, 1:]), size(samples)
-        reach *= self._share[at[:, :-3]]
+        reach *= share
         reach += np.maximum(sized[:, 1:-2], sized[:, 2:-1])
-        window, k = np.nonzero(~(reach <= level[rows, None]))
-        return window, at[window, k + 1]
+        window, k = places(~(reach <= level[rows, None]))
+        return window, first[window] + k + 1
+
+
+def places(chosen: NDArray[np.bool_]) -> Places:
+    """Return the rows and columns of the true entries of a matrix; faster than `numpy.nonzero` where they are few."""
+    return tuple(np.divmod(np.flatnonzero(chosen), max(1, chosen.shape[1])))
 
 
 def blocks(f: Array) -> Iterator[slice]:
@@ -346,7 +370,7 @@ def _largest(t: Array, f: Array, size: Callable[[Array], Array], extrapolated: b
     low, high = bulges.extrema(f)
     top = np.maximum(size(low), size(high)).max(axis=1)
     level = np.where(np.isfinite(top), top, np.nan)
-    rows, chosen = bulges.beyond(f, size, level, np.maximum(-low, high))
+    rows, chosen = bulges.beyond(f, size, level, (low, high))
     p = pieces(t, f, chosen, rows)
     inner = np.fmax.reduce(size(p(p.cuts)), axis=0)
     np.fmax.at(top, rows, inner if extrapolated else np.where(p.begins, -np.inf, inner))
@@ -386,7 +410,9 @@ class Smooth:
         d = slope[:, 1:] - slope[:, :-1]
         d /= self.width
         third, size = d[:, 1:] - d[:, :-1], np.abs(d)
-        smooth = np.abs(third) <= _CURVATURES * np.minimum(size[:, :-1], size[:, 1:])
+        smaller = np.minimum(size[:, :-1], size[:, 1:])
+        smaller *= _CURVATURES
+        smooth = np.abs(third, out=size[:, 1:]) <= smaller
         third /= self.span
         return slope, d, third, smooth
 

@@ -244,7 +244,7 @@ def _last_entries(t: Array, e: Array, edges: Array) -> Array:
     never = (np.abs(e[:, -1]) > edges) | ~(peaks.max(axis=1) < HUGE)
     found = np.where(never, np.inf, -np.inf)
     first = np.minimum(bulges.last_beyond(e, edges, peaks), t.size - 2)
-    rows, chosen = bulges.beyond(e, np.abs, np.where(never, np.nan, edges), peaks, first)
+    rows, chosen = bulges.beyond(e, np.abs, np.where(never, np.nan, edges), (low, high), first)
     p = pieces(t, e, chosen, rows)
     cuts, values = p.cuts, p.values
     beyond = np.abs(values) > edges[rows]

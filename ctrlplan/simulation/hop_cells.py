@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from ctrlplan._types import Array
 from ctrlplan.simulation.collocation import NODES, REACH, PartMaps, basis_at, is_resolved, value_at_start
 from ctrlplan.simulation.delayed_run import DelayedRun, Jump, Parts
-from ctrlplan.simulation.sampled_form import Late
+from ctrlplan.simulation.sampled_form import DelayedForm, Late
 from ctrlplan.simulation.signals import breakpoints_of
 from ctrlplan.trajectories.chebyshev import points, transform
 
@@ -37,8 +38,8 @@ _NOISE = 1e-13
 _ENTRIES = 2**21
 """Maximum number of entries of the maps of the cells that are treated together."""
 
-_SEVERAL = -2
-"""Instead of a cell that a delay reads: several cells."""
+_KEPT = 5 * 2**17
+"""Maximum number of their entries that are kept for further runs."""
 
 
 def solved_by_hops(run: DelayedRun, limit: int) -> Parts | None:
@@ -49,24 +50,29 @@ def solved_by_hops(run: DelayedRun, limit: int) -> Parts | None:
     SolverError
         If a state overflows.
     """
+    breaks = np.asarray(breakpoints_of(run.signals, run.first, run.last))
     for hops in _HOPS:
-        marks = _marks(run, hops, min(MARKS, limit))
-        cells = None if marks is None else _HopCells.of(run, marks, limit)
-        if cells is None:
+        key = run.first, run.last, breaks.tobytes(), hops, min(MARKS, limit)
+        marks = run.form.marks.get(key, partial(_marks, run, breaks, hops, min(MARKS, limit)))
+        found = None if marks is None else _resolving(run, key, marks, limit)
+        if found is None:
             return None
-        parts, resolved = cells.solved(run)
+        parts, resolved = _solved(run, *found)
         if resolved:
             return parts
     return None
 
 
-def _marks(run: DelayedRun, hops: int, limit: int) -> Array | None:
-    """Times [s] since the start at which signals are not smooth, increasing; None if there are more than a limit."""
+def _marks(run: DelayedRun, breaks: Array, hops: int, limit: int) -> Array | None:
+    """Times [s] since the start at which signals are not smooth, increasing; None if there are more than a limit.
+
+    breaks: breakpoints [s] of the functions of time.
+    """
     lates, tolerance = run.form.lates, run.tolerance
     delays = [late.delay for late in lates]
     direct = [bool(late.from_w[:, run.form.given].any() or _from_held(run, late)) for late in lates]
     among = [[bool(late.from_w[:, other.columns].any()) for late in lates] for other in lates]
-    events = np.append(breakpoints_of(run.signals, run.first, run.last), run.instants.times[run.instants.due > 0])
+    events = np.append(breaks, run.instants.times[run.instants.due > 0])
     # Each entry: time, the delay that returns it or -1, and the lowest derivative that jumps.
     queue = [(float(t), -1, 0) for t in events - run.first if t > tolerance]
     queue += [(0.0, -1, 0), (run.span, -1, hops)]
@@ -97,72 +103,97 @@ def _from_held(run: DelayedRun, late: Late) -> bool:
     return bool(own.any())
 
 
-@dataclass(frozen=True, eq=False)
-class _HopCells:
-    """Cells of a run.
+def _resolving(run: DelayedRun, key: tuple[object, ...], marks: Array, limit: int) -> tuple[HopCells, Array] | None:
+    """Cells between marks, and the functions of time (ncells, nodes, ngiven) that they resolve; None if too many."""
+    longest = min([late.delay for late in run.form.lates])
+    longest = min(longest, REACH / max(run.form.norm, 1e-300))
+    # What is sampled at the end of the run is seen in a cell after it.
+    edges = np.append(marks, marks[-1] + 1e-3 * min(longest, run.span))
+    for _ in range(_HALVINGS):
+        counts = np.ceil(np.diff(edges) / longest * (1.0 - 1e-12)).astype(int)
+        if counts.sum() > limit:
+            return None
+        cells = run.form.cells.get((key, longest), partial(HopCells, run.form, edges, counts, longest, run.tolerance))
+        values = run.values(cells.starts[:, None] + cells.lengths[:, None] * points(NODES - 1, 0.0, 1.0))
+        if is_resolved(values, run.noise(float(cells.lengths.max()))):
+            return cells, values
+        longest *= 0.5
+    return None
+
+
+def _solved(run: DelayedRun, cells: HopCells, values: Array) -> tuple[Parts, bool]:
+    """States and inputs of the delays, and whether they are resolved."""
+    march, jumps, count = _March(run, cells.starts.size), run.jumps(cells.starts), cells.starts.size
+    with np.errstate(all="ignore"):
+        for begin in range(0, count, cells.together):
+            some = slice(begin, min(begin + cells.together, count))
+            maps, reads = cells.equations(some)
+            march.begin(maps, values, some)
+            first = begin
+            while first < some.stop:
+                last = min(int(cells.ends[first]), some.stop)
+                march.advance(reads, jumps, slice(first, last))
+                first = last
+            march.fill(maps, values, some)
+    noise = max(_NOISE, run.noise(cells.longest)) if run.form.given.size else _NOISE
+    resolved = is_resolved(march.states, noise) and is_resolved(march.stored, noise)
+    return Parts.of(run, cells.starts, cells.lengths, march.states, march.stored), resolved
+
+
+class HopCells:
+    """Cells of a run, and the equations in them, equal for all functions of time with the same breakpoints.
+
+    Parameters
+    ----------
+    form : DelayedForm
+        The loop.
+    edges : ndarray
+        Times [s] since the start between which there are cells.
+    counts : ndarray of int
+        Numbers of equal cells between them.
+    longest : float
+        Bound of the lengths [s].
+    tolerance : float
+        Difference of two times that counts as rounding [s].
 
     Attributes
     ----------
     starts, lengths : ndarray, shape (ncells,)
         Starts and lengths [s].
-    longest : float
-        Bound of the lengths [s].
-    values : ndarray, shape (ncells, nodes, ngiven)
-        Functions of time at the nodes.
+    ends : ndarray of int, shape (ncells,)
+        Cells up to which all that delays return was stored before a cell.
+    together : int
+        Number of cells that are treated together.
     """
 
-    starts: Array
-    lengths: Array
-    longest: float
-    values: Array
+    def __init__(
+        self, form: DelayedForm, edges: Array, counts: NDArray[np.intp], longest: float, tolerance: float
+    ) -> None:
+        self._form, self.longest, self._tolerance = form, longest, tolerance
+        within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        self.starts = np.repeat(edges[:-1], counts) + within * np.repeat(np.diff(edges) / counts, counts)
+        self.lengths = np.append(self.starts[1:], edges[-1]) - self.starts
+        count, n, width, nw = self.starts.size, len(form.a), form.delayed.size, form.b.shape[1]
+        until = self.starts + min(late.delay for late in form.lates) + tolerance
+        self.ends = np.maximum(np.searchsorted(self.starts + self.lengths, until, side="right"), np.arange(count) + 1)
+        entries = (n + NODES * (n + width)) * (n + NODES * nw)
+        self.together = max(1, _ENTRIES // entries)
+        self._keeps = count * entries <= _KEPT
+        self._kept: tuple[PartMaps, list[_Read]] | None = None
 
-    @classmethod
-    def of(cls, run: DelayedRun, marks: Array, limit: int) -> _HopCells | None:
-        """Cells between marks; None if there are more than a limit."""
-        longest = min([late.delay for late in run.form.lates])
-        longest = min(longest, REACH / max(run.form.norm, 1e-300))
-        # What is sampled at the end of the run is seen in a cell after it.
-        edges = np.append(marks, marks[-1] + 1e-3 * min(longest, run.span))
-        for _ in range(_HALVINGS):
-            counts = np.ceil(np.diff(edges) / longest * (1.0 - 1e-12)).astype(int)
-            if counts.sum() > limit:
-                return None
-            within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-            starts = np.repeat(edges[:-1], counts) + within * np.repeat(np.diff(edges) / counts, counts)
-            lengths = np.append(starts[1:], edges[-1]) - starts
-            values = run.values(starts[:, None] + lengths[:, None] * points(NODES - 1, 0.0, 1.0))
-            if is_resolved(values, run.noise(float(lengths.max()))):
-                return cls(starts, lengths, longest, values)
-            longest *= 0.5
-        return None
+    def equations(self, some: slice) -> tuple[PartMaps, list[_Read]]:
+        """Maps of some cells, and what each delay reads in them."""
+        if self._kept is not None:
+            return self._kept
+        maps = self._form.collocation.maps(self.lengths[some], self.longest)
+        found = maps, [self._read(late, some) for late in self._form.lates]
+        if self._keeps:
+            self._kept = found
+        return found
 
-    def solved(self, run: DelayedRun) -> tuple[Parts, bool]:
-        """States and inputs of the delays, and whether they are resolved."""
-        n, width, count = run.state.size, run.form.delayed.size, self.starts.size
-        march = _March(run, count)
-        together = max(1, _ENTRIES // ((n + NODES * (n + width)) * (n + NODES * run.form.b.shape[1])))
-        # What the delays return in cells up to here was stored before the first of them.
-        until = self.starts + min(late.delay for late in run.form.lates) + run.tolerance
-        ends = np.maximum(np.searchsorted(self.starts + self.lengths, until, side="right"), np.arange(count) + 1)
-        jumps = run.jumps(self.starts)
-        with np.errstate(all="ignore"):
-            for begin in range(0, count, together):
-                some = slice(begin, min(begin + together, count))
-                maps = run.form.collocation.maps(self.lengths[some], self.longest)
-                reads = [self._read(run, late, some) for late in run.form.lates]
-                first = begin
-                while first < some.stop:
-                    last = min(int(ends[first]), some.stop)
-                    march.advance(maps, reads, self.values, jumps, slice(first, last), begin)
-                    first = last
-                march.fill(maps, self.values, some)
-        noise = max(_NOISE, run.noise(self.longest)) if run.form.given.size else _NOISE
-        resolved = is_resolved(march.states, noise) and is_resolved(march.stored, noise)
-        return Parts.of(run, self.starts, self.lengths, march.states, march.stored), resolved
-
-    def _read(self, run: DelayedRun, late: Late, some: slice) -> _Read:
+    def _read(self, late: Late, some: slice) -> _Read:
         """What a delay reads in some cells."""
-        starts, lengths, tolerance = self.starts[some], self.lengths[some], run.tolerance
+        starts, lengths, tolerance = self.starts[some], self.lengths[some], self._tolerance
         nodes = lengths[:, None] * points(NODES - 1, 0.0, 1.0)
         since = starts - late.delay
         middle = self._cells_at(since + 0.5 * lengths)
@@ -175,7 +206,7 @@ class _HopCells:
         x = 2.0 * (since[:, None] - self.starts[place] + nodes) / self.lengths[place] - 1.0
         table = basis_at(np.clip(x, -1.0, 1.0)) @ transform(np.eye(NODES)).T
         passed = int(np.count_nonzero(which.min(axis=1) < 0))
-        return _Read(which, np.where(one, middle, _SEVERAL).tolist(), table, late.initial, passed)
+        return _Read(which, table, late.initial, passed)
 
     def _cells_at(self, since: Array) -> NDArray[np.intp]:
         """Cells that contain times [s]; -1 before the start."""
@@ -190,8 +221,6 @@ class _Read:
     ----------
     which : ndarray of int, shape (ncells, nodes)
         Cells that contain the nodes, a delay before; -1 before the run.
-    only : list of int
-        Cell that contains all nodes, -1 before the run, -2 where there are several.
     table : ndarray, shape (ncells, nodes, nodes)
         Values at the nodes from those at the nodes of the cells.
     initial : ndarray, shape (width,)
@@ -201,15 +230,29 @@ class _Read:
     """
 
     which: NDArray[np.intp]
-    only: list[int]
     table: Array
     initial: Array
     passed: int
 
+    @cached_property
+    def alone(self) -> dict[int, tuple[slice, Array]]:
+        """Nodes of all cells that one cell reads, and its values from theirs; filled when they are first used."""
+        return {}
+
+    def value(self, stored: Array, k: int) -> Array:
+        """Values (nodes, width) in one cell that is not read before the run, from those (ncells * nodes, width)."""
+        found = self.alone.get(k)
+        if found is None:
+            which, first = self.which[k], int(self.which[k].min())
+            count = int(which.max()) + 1 - first
+            matrix = np.zeros((NODES, count, NODES))
+            matrix[np.arange(NODES), which - first] = self.table[k]
+            nodes = slice(first * NODES, (first + count) * NODES)
+            self.alone[k] = found = nodes, matrix.reshape(NODES, -1)
+        return np.asarray(found[1] @ stored[found[0]])
+
     def values(self, stored: Array, first: int, last: int) -> Array:
-        """Values (nodes, width) in a cell, or (ncells, nodes, width) in several."""
-        if last == first + 1 and self.only[first] >= 0:
-            return np.asarray(self.table[first] @ stored[self.only[first]])
+        """Values (ncells, nodes, width) in some cells."""
         which = self.which[first:last]
         if first >= self.passed:
             return np.einsum("kjf,kjfw->kjw", self.table[first:last], stored[which])
@@ -227,35 +270,61 @@ class _March:
     """
 
     def __init__(self, run: DelayedRun, count: int) -> None:
-        self._rows, self._state, width = run.form.rows, run.state, run.form.delayed.size
-        self.states, self.stored = np.empty((count, NODES, run.state.size)), np.empty((count, NODES, width))
-        self._starts, self._back = np.empty((count, run.state.size)), np.empty((count, NODES, width))
+        self._rows, self._state, self._n = run.form.rows, run.state, run.state.size
+        width = run.form.delayed.size
+        self.states, self.stored = np.empty((count, NODES, self._n)), np.empty((count, NODES, width))
+        self._inputs = np.empty((count, self._n + NODES * width))  # states at the starts, and delayed values
+        self._back = self._inputs[:, self._n :].reshape(count, NODES, width)
+        self._by_rows = [self.stored.reshape(count * NODES, width)[:, rows] for rows in self._rows]
 
-    def advance(
-        self, maps: PartMaps, reads: list[_Read], given: Array, jumps: dict[int, Jump], cells: slice, begin: int
-    ) -> None:
-        """Compute cells whose delayed values are known; `begin`: the cell of the first map."""
-        n, back = self._state.size, self._back[cells]
-        own = slice(cells.start - begin, cells.stop - begin)
+    def begin(self, maps: PartMaps, given: Array, some: slice) -> None:
+        """Begin with cells that are treated together."""
+        known, count = self._inputs.shape[1], some.stop - some.start
+        self._first, self._steps = some.start, maps.steps[..., :known]
+        self._forced = np.matmul(maps.steps[..., known:], given[some].reshape(count, -1, 1))[..., 0]
+
+    def advance(self, reads: list[_Read], jumps: dict[int, Jump], cells: slice) -> None:
+        """Compute cells whose delayed values are known."""
+        own = slice(cells.start - self._first, cells.stop - self._first)
+        if cells.stop == cells.start + 1 and own.start >= max(read.passed for read in reads):
+            self._advance_one(reads, jumps, cells.start, own.start)
+            return
+        n, back = self._n, self._back[cells]
         for rows, read in zip(self._rows, reads, strict=True):
             back[..., rows] = read.values(self.stored[..., rows], own.start, own.stop)
-        steps = maps.steps[own]
-        inputs = np.concatenate([back.reshape(len(back), -1), given[cells].reshape(len(back), -1)], axis=1)
-        forced = np.matmul(steps[..., n:], inputs[..., None])[..., 0]
-        state, starts = self._state, self._starts
+        steps = self._steps[own]
+        forced = np.matmul(steps[..., n:], back.reshape(len(back), -1, 1))[..., 0]
+        forced += self._forced[own]
+        state, starts = self._state, self._inputs[:, :n]
         for k in range(cells.start, cells.stop):
             if k in jumps:
-                jump, of_back, constant = jumps[k]
-                state = jump @ state + (of_back @ (value_at_start() @ self._back[k]) + constant)
+                state = self._jumped(jumps[k], state, k)
             starts[k] = state
             state = state + (steps[k - cells.start, :n, :n] @ state + forced[k - cells.start, :n])
         self._state = state
         found = np.matmul(steps[:, n:, :n], starts[cells, :, None])[..., 0] + forced[:, n:]
         self.stored[cells] = found.reshape(back.shape)
 
+    def _advance_one(self, reads: list[_Read], jumps: dict[int, Jump], k: int, own: int) -> None:
+        """The same for one cell, whose delayed values are not from before the run."""
+        n, inputs, back = self._n, self._inputs[k], self._back[k]
+        for rows, read, stored in zip(self._rows, reads, self._by_rows, strict=True):
+            back[:, rows] = read.value(stored, own)
+        state = self._jumped(jumps[k], self._state, k) if k in jumps else self._state
+        inputs[:n] = state
+        after = self._steps[own].dot(inputs)
+        after += self._forced[own]
+        self._state = state + after[:n]
+        self.stored[k] = after[n:].reshape(back.shape)
+
+    def _jumped(self, jump: Jump, state: Array, k: int) -> Array:
+        """State after a jump at the start of a cell."""
+        matrix, of_back, constant = jump
+        return np.asarray(matrix @ state + (of_back @ (value_at_start() @ self._back[k]) + constant))
+
     def fill(self, maps: PartMaps, given: Array, cells: slice) -> None:
         """Compute the states at the nodes of cells."""
         count = cells.stop - cells.start
-        known = [x[cells].reshape(count, -1) for x in (self._starts, self._back, given)]
-        found = np.matmul(maps.states, np.concatenate(known, axis=1)[..., None])
+        known = np.concatenate([self._inputs[cells], given[cells].reshape(count, -1)], axis=1)
+        found = np.matmul(maps.states, known[..., None])
         self.states[cells] = found.reshape(count, NODES, -1)

@@ -97,7 +97,8 @@ class Interpreted:
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
         self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
         self._for_samples: dict[tuple[int, ...], list[Call]] = {}
-        self._a, self._b, self._linear_states, self._linear_columns, others = _merged_linear(network)
+        self._a, self._b, linear, self._linear_columns, others = _merged_linear(network)
+        self._linear_states = _as_slice(linear) if linear.size else None
         self._moving = [(i, self._updates[i], network.states[i], network.fed[i]) for i in others]
 
     def rates(self, t: float, x: Array, time_values: Array) -> Array:
@@ -110,10 +111,8 @@ class Interpreted:
     def rates_of(self, t: float, x: Array, w: Array) -> Array:
         """The same from all signals; for a discrete system the next states."""
         dx = np.zeros(x.size)
-        if self._linear_states.size:
-            dx[self._linear_states] = self._a.dot(x.take(self._linear_states)) + self._b.dot(
-                w.take(self._linear_columns)
-            )
+        if self._linear_states is not None:
+            dx[self._linear_states] = self._a.dot(x[self._linear_states]) + self._b.dot(w.take(self._linear_columns))
         for i, update, place, fed in self._moving:
             try:
                 found = update(t, x[place], fed(w))
@@ -302,17 +301,27 @@ class Interpreted:
 
 
 class InterpretedSolver:
-    """LSODA for a network, segment by segment."""
+    """LSODA for a network, segment by segment.
+
+    Attributes
+    ----------
+    equations : Interpreted
+        The equations.
+    plain : bool
+        Whether the scaled integrated states are all states as they are.
+    switches : list of float
+        Times at which the equations switch, inside of a segment.
+    """
 
     calls_blocks = relative_by_state = True
 
     def __init__(self, equations: Interpreted, tolerances: Tolerances, scales: Scales) -> None:
-        self._equations, self._scales = equations, scales
+        self.equations, self._scales = equations, scales
         self._rtol, self._atol = np.maximum(tolerances.rtol, _MIN_RTOL), tolerances.atol
         self._moving = equations.network.moving
         self._shift, self._scale = scales.shift[self._moving], scales.scale[self._moving]
         everything = self._moving.size == scales.scale.size
-        self._plain = everything and bool(np.all(scales.scale == 1.0) and np.all(scales.shift == 0.0))
+        self.plain = everything and bool(np.all(scales.scale == 1.0) and np.all(scales.shift == 0.0))
         self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
         self._segments, self._next = 0, 0
         self.switches: list[float] = []
@@ -325,19 +334,19 @@ class InterpretedSolver:
     @property
     def evaluations(self) -> int:
         """Evaluations of the right-hand side so far."""
-        return self._equations.evaluations
+        return self.equations.evaluations
 
     def count(self) -> None:
         """Start counting evaluations; here they are always counted."""
 
     def scaled_rates(self, t: float, z: Array, time_values: Array, start: Array) -> Array:
         """Derivatives of the scaled integrated states; the others are those at the start of the segment."""
-        found = self._equations.rates(t, self.states_of(z, start), time_values)
-        return found if self._plain else np.asarray(found[self._moving] / self._scale)
+        found = self.equations.rates(t, self.states_of(z, start), time_values)
+        return found if self.plain else np.asarray(found[self._moving] / self._scale)
 
     def states_of(self, z: Array, start: Array) -> Array:
         """All states for scaled integrated states."""
-        if self._plain:
+        if self.plain:
             return z.copy()
         x = start.copy()
         x[self._moving] = self._shift + self._scale * z
@@ -349,11 +358,11 @@ class InterpretedSolver:
 
     def signals(self, times: Array, states: Array, time_values: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
-        return self._equations.all_signals(times, states, time_values)
+        return self.equations.all_signals(times, states, time_values)
 
     def outputs(self, times: Array, states: Array, time_values: Array) -> Array:
         """Outputs (noutputs, ntime) of the network."""
-        return self._equations.network.to_outputs(self.signals(times, states, time_values))
+        return self.equations.network.to_outputs(self.signals(times, states, time_values))
 
     def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
         """Jacobian of the integrated states, by finite differences, (ntime, nmoving, nmoving)."""
@@ -369,7 +378,7 @@ class InterpretedSolver:
 
     def rates(self, times: Array, states: Array, time_values: Array) -> Array:
         """Derivatives (nstates, ntime) of the states."""
-        rows = [self._equations.rates(t, states[:, k], time_values[:, k]) for k, t in enumerate(times.tolist())]
+        rows = [self.equations.rates(t, states[:, k], time_values[:, k]) for k, t in enumerate(times.tolist())]
         return np.array(rows).T.reshape(-1, times.size)
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
@@ -401,6 +410,11 @@ class InterpretedSolver:
         """Times at which the equations switch: for Python functions only the declared ones are known."""
         return []
 
+    @property
+    def reviewed(self) -> int:
+        """Number of evaluations from which on `review` is called."""
+        return max(self._next, _EVALUATIONS + _A_SEGMENT * self._segments)
+
     def review(self, rates: _Watched, t: float, z: Array) -> None:
         """Raise if a block is the cause of too many evaluations.
 
@@ -411,9 +425,7 @@ class InterpretedSolver:
             and a block is discontinuous, has an infinite slope or is random
             there; checked every 20,000 evaluations.
         """
-        if self._equations.evaluations < max(self._next, _EVALUATIONS + _A_SEGMENT * self._segments):
-            return
-        self._next = self._equations.evaluations + _REVIEWED
+        self._next = self.equations.evaluations + _REVIEWED
         found = self._cause(rates, t, z)
         if found:
             raise self._message(rates, found)
@@ -451,7 +463,7 @@ class InterpretedSolver:
         return float(solver.t), np.asarray(solver.y), ""
 
     def _cause(self, rates: _Watched, t: float, z: Array) -> str:
-        equations, x = self._equations, self.states_of(z, rates.start)
+        equations, x = self.equations, self.states_of(z, rates.start)
         time_values = rates.series(t)
         try:
             w = equations.signals(t, x, time_values)
@@ -598,7 +610,8 @@ class _Watched:
     def __init__(self, solver: InterpretedSolver, series: Series, left: float, right: float, start: Array) -> None:
         self._solver, self.series, self.left, self.right, self.start = solver, series, left, right, start
         self.defined, self._within = left, within(left, right, solver.switches)
-        self._ones = np.ones(solver.moving.size)
+        self._ones, self._near = np.ones(solver.moving.size), _INSTANT * (right - left)
+        self._equations, self._review = solver.equations, solver.reviewed
         self.begin(_CALLS)
 
     def begin(self, calls: int) -> None:
@@ -607,13 +620,19 @@ class _Watched:
 
     def __call__(self, t: float, z: Array) -> Array:
         self._count += 1
-        if abs(t - self._about) > _INSTANT * (self.right - self.left):
+        if abs(t - self._about) > self._near:
             self._about, self._count = t, 0
         elif self._count > self._calls:
             raise _StalledError("the solution cannot be continued")
-        self._solver.review(self, t, z)
-        inside = min(max(t, self._within[0]), self._within[1])
-        rates = self._solver.scaled_rates(inside, z, self.series(inside), self.start)
+        if self._equations.evaluations >= self._review:
+            self._solver.review(self, t, z)
+            self._review = self._solver.reviewed
+        low, high = self._within
+        inside = low if t < low else min(t, high)
+        if self._solver.plain:
+            rates = self._equations.rates(inside, z.copy(), self.series(inside))
+        else:
+            rates = self._solver.scaled_rates(inside, z, self.series(inside), self.start)
         if t > self.defined and math.isfinite(rates.dot(self._ones)):
             self.defined = t
         return rates

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import signal
 import threading
+
+# The function of the module `signal` converts to members of an enumeration, which takes forty times as long.
+from _signal import getsignal  # type: ignore[import-not-found]
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -57,7 +60,7 @@ def _wrapped_handlers() -> Iterator[None]:
     token = _RAISED.set(raised)
     try:
         for number in _SIGNALS if threading.current_thread() is threading.main_thread() else ():
-            handler = signal.getsignal(number)
+            handler = getsignal(number)
             if callable(handler):
                 handlers[number] = handler
                 signal.signal(number, accompanied)
@@ -72,7 +75,7 @@ def _wrapped_handlers() -> Iterator[None]:
         inside = False
         _RAISED.reset(token)
         for key, handler in handlers.items():
-            if signal.getsignal(key) is accompanied:
+            if getsignal(key) is accompanied:
                 signal.signal(key, handler)
     if raised:
         raise raised[0]

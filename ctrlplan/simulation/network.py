@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from operator import methodcaller
 
 import control as ct
 import numpy as np
@@ -520,12 +521,8 @@ def _product(matrix: Array) -> Callable[[Array], Array]:
     """Product with a matrix in which 0 times nan is 0: a nan affects only what depends on it."""
     rows, columns = np.nonzero(matrix)
     if np.array_equal(rows, np.arange(len(matrix))) and np.all(matrix[rows, columns] == 1.0):
-        return partial(_selected, columns)
+        return methodcaller("take", columns, 0)
     return partial(_multiplied, csr_array(matrix))
-
-
-def _selected(rows: NDArray[np.intp], signals: Array) -> Array:
-    return signals.take(rows, axis=0)
 
 
 def _multiplied(matrix: csr_array, signals: Array) -> Array:

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._lru import Lru
 from ctrlplan._types import Array
 from ctrlplan.simulation.exact import state_scale
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, closed, linear_forms, singular_loop
@@ -33,6 +34,8 @@ from ctrlplan.simulation.segments import as_fraction
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.collocation import Collocation
+    from ctrlplan.simulation.hop_cells import HopCells
+    from ctrlplan.simulation.schedule import Schedule
 
 Timing = tuple[Fraction, Fraction]
 """Period and offset [s]: sample times are offset, offset + period, ... after the start of a run."""
@@ -42,6 +45,9 @@ _SHORT = 16
 
 _TIMINGS = 62
 """Maximum number of different periods and offsets, one bit each."""
+
+_SCHEDULES = 2
+"""Number of runs of different start or end whose steps are kept."""
 
 _SAME = 1e-14
 """Difference of a delay from whole periods, relative to both, that is rounding."""
@@ -158,6 +164,8 @@ class SampledForm:
         Initial states of the registers.
     lines : tuple of Line
         Registers of many samples. What they return follows the functions of time in w at an instant.
+    schedules : Lru
+        Steps of the last runs, by their start and end [s].
     """
 
     name: str
@@ -172,7 +180,8 @@ class SampledForm:
     lates: tuple[Late, ...]
     registers: Array
     lines: tuple[Line, ...] = ()
-    _jumps: dict[int, tuple[Array, Array]] = field(default_factory=dict, repr=False)
+    schedules: Lru[tuple[float, float], Schedule] = field(default_factory=lambda: Lru(_SCHEDULES), init=False)
+    _jumps: dict[int, tuple[Array, Array]] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def timings(self) -> list[Timing]:
@@ -197,7 +206,7 @@ class SampledForm:
             return matrix * (1.0 + amount * rng.choice([-1.0, 1.0], matrix.shape))
 
         parts = [replace(p, a=near(p.a), b=near(p.b), c=near(p.c), d=near(p.d)) for p in self.parts]
-        return replace(self, a=near(self.a), b=near(self.b), parts=tuple(parts), _jumps={})
+        return replace(self, a=near(self.a), b=near(self.b), parts=tuple(parts))
 
     def jump(self, due: int) -> tuple[Array, Array]:
         """Matrices J and K of an instant at which the timings with these bits are due.
@@ -294,12 +303,16 @@ class DelayedForm:
         The flow of all states.
     lates : tuple of Late
         Delays; at least one.
+    marks, cells : Lru
+        Times at which the signals of the last runs are not smooth, and cells between them.
     """
 
     base: SampledForm
     a: Array
     b: Array
     lates: tuple[Late, ...]
+    marks: Lru[tuple[object, ...], Array | None] = field(default_factory=lambda: Lru(_SCHEDULES), init=False)
+    cells: Lru[tuple[object, ...], HopCells] = field(default_factory=lambda: Lru(_SCHEDULES), init=False)
 
     @cached_property
     def delayed(self) -> NDArray[np.intp]:

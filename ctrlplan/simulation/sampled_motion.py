@@ -19,10 +19,10 @@ from ctrlplan._types import Array
 from ctrlplan.simulation.built_forms import NotApplicableError
 from ctrlplan.simulation.cell_extrema import Cells, joined
 from ctrlplan.simulation.flow_kernel import REACH, FlowKernel, gauss_nodes, to_legendre
-from ctrlplan.simulation.instants import Instants, instants_of
+from ctrlplan.simulation.instants import Instants
 from ctrlplan.simulation.interpreted import SolverError
-from ctrlplan.simulation.recurrences import DelayLine, growth, marched_with_lines
 from ctrlplan.simulation.sampled_form import Late, Line, SampledForm
+from ctrlplan.simulation.schedule import Schedule, schedule_of
 from ctrlplan.simulation.segments import time_tolerance, values_after
 from ctrlplan.simulation.signals import TimeSignal, signal_values
 from ctrlplan.trajectories.chebyshev import points, transform
@@ -56,9 +56,6 @@ _KINDS = 64
 
 _TOGETHER = 2**12
 """Number of times whose matrices are computed together."""
-
-_INSTANTS = 5e6
-"""Maximum number of sample times of a run, whose states are stored."""
 
 _PIECE = 24
 """Number of Chebyshev terms of a signal in a part of an interval."""
@@ -94,6 +91,11 @@ class LateSignal:
         self._firsts = [(float(first + offset), own @ z) for offset, own in late.firsts if (own @ z).any()]
         self._marks = [first, *(end for end, _ in self._firsts)]
         self.motion: SampledMotion | None = None
+
+    @property
+    def vanishes(self) -> bool:
+        """Whether it is always 0, as where registers hold all that has passed the delay."""
+        return not (self._late.initial.any() or self._signals or self._firsts or self._late.follows)
 
     def breakpoints_between(self, t0: float, t1: float) -> Array:
         """Start of the delayed signals, and their breakpoints after it."""
@@ -201,19 +203,18 @@ class SampledMotion:
     ) -> None:
         self.form, self.tolerance = form, time_tolerance(first, last)
         self._signals = signals
-        fed = np.flatnonzero(form.b.any(axis=0) if used is None else form.b.any(axis=0) | used)
+        schedule = schedule_of(form, first, last, self.tolerance)
+        needed = form.b.any(axis=0) if used is None else form.b.any(axis=0) | used
+        fed = np.flatnonzero(needed & ~_vanishing(signals))
         self._fed = _Chosen(signals, fed)
-        count = sum((last - first) / float(period) for period, _ in form.timings)
-        if count > _INSTANTS:
-            raise NotApplicableError(f"{form.name} has {count:.3g} sample times, more than {_INSTANTS:.0e}")
-        instants = instants_of(form.timings, first, last, self.tolerance)
-        self._spans, self._values = _resolved(_Spans(instants, last, self._fed, self.tolerance), self._fed)
+        self._spans, self._values = _resolved(_Spans(schedule.instants, last, self._fed, self.tolerance), self._fed)
         self.instants = self._spans.instants
-        self._held = np.setdiff1d(np.flatnonzero(form.a.any(axis=0)), form.moving)
+        self._schedule = schedule if self.instants is schedule.instants else Schedule(form, self.instants)
+        self._steps = self._schedule.steps()
+        self._held = schedule.held
         order = self._values.shape[1] // max(1, fed.size)
         self._kernel = FlowKernel(form.a[:, form.moving], form.a[:, self._held], form.b[:, fed], order)
         with np.errstate(all="ignore"):
-            self._changes = self._kernel.over(self._spans.different)
             self.states = self._run(z)
 
     def at(self, times: Array) -> Array:
@@ -225,6 +226,8 @@ class SampledMotion:
             return z
         since = times - spans.starts[which]
         inside = since > self.tolerance
+        if not spans.broken.size and not inside.any():
+            return z
         whole = inside & spans.whole[which]
         if np.count_nonzero(np.bincount(spans.kinds[which[whole]], minlength=1)) > _KINDS:
             whole[:] = False
@@ -240,7 +243,7 @@ class SampledMotion:
     @property
     def growth(self) -> float:
         """Growth of a perturbation of the states over the run, about."""
-        return growth(*self._steps, self._lines)
+        return self._schedule.growth(self._steps)
 
     def registers_at(self, times: Array) -> Array:
         """States (nz - nstates, ntime) of the registers."""
@@ -254,64 +257,47 @@ class SampledMotion:
 
     def _run(self, z: Array) -> Array:
         """States (ninstants, nz) at the instants."""
-        form, instants, moving = self.form, self.instants, self.form.moving
-        masks, due = np.unique(instants.due, return_inverse=True)
-        jumps = [form.jump(int(mask)) for mask in masks]
-        nw = form.signals_w.shape[1]
-        read = _Chosen(self._signals, np.flatnonzero(np.any([k[:, :nw].any(axis=0) for _, k in jumps], axis=0)))
-        values = read.after(instants.times, self.tolerance).T
-        forced = np.empty((instants.times.size, z.size))
-        moved = self._forced()
-        for k, (jump, given) in enumerate(jumps):
-            own = due == k
+        form, schedule, times, moving = self.form, self._schedule, self.instants.times, self.form.moving
+        read = _Chosen(self._signals, schedule.read)
+        values = read.after(times, self.tolerance).T
+        forced, moved = np.empty((times.size, z.size)), self._forced()
+        for own, (jump, given) in zip(schedule.places, schedule.jumps, strict=True):
             forced[own] = values[own] @ given[:, read.columns].T
-            later = np.flatnonzero(own[1:])
-            forced[later + 1] += moved[later] @ jump[:, moving].T
-        pairs, kinds = np.unique(self._spans.length_of[:-1] * masks.size + due[1:], return_inverse=True)
-        lengths, masks_of = np.divmod(pairs, masks.size)
-        matrices = np.empty((pairs.size, z.size, z.size))
-        flows = np.zeros((self._changes.shape[0], moving.size, z.size))
-        flows[:, :, np.concatenate([moving, self._held])] = self._changes[:, :, : moving.size + self._held.size]
-        for k, (jump, _) in enumerate(jumps):
-            own = np.flatnonzero(masks_of == k)
-            matrices[own] = np.matmul(jump[:, moving], flows[lengths[own]]) + jump
-        self._steps = matrices, kinds
-        self._lines = [self._line(line, [jump[1] for jump in jumps], due) for line in form.lines]
-        start = jumps[due[0]][0] @ z + forced[0]
-        for line in self._lines:
+            if moved is not None:
+                later = own[own > 0]
+                forced[later] += moved[later - 1] @ jump[:, moving].T
+        start = schedule.jumps[schedule.due[0]][0] @ z + forced[0]
+        for line in self._steps.lines:
             if line.at_start:
-                start += line.into[0] @ line.initial
-        found = marched_with_lines(start, matrices, kinds, forced[1:], self._lines)
+                start += line.into[line.kinds[0]] @ line.initial
+        found = self._steps.marched(start, forced[1:], [self._given(*pair) for pair in schedule.lines])
         if not np.isfinite(found).all():
-            at = instants.times[int(np.argmin(np.isfinite(found).all(axis=1)))]
+            at = times[int(np.argmin(np.isfinite(found).all(axis=1)))]
             raise SolverError(
-                f"states of {form.name} must stay finite up to {instants.times[-1]:g} s, got an overflow at {at:g} s"
+                f"states of {form.name} must stay finite up to {times[-1]:g} s, got an overflow at {at:g} s"
             )
         return found
 
-    def _line(self, line: Line, inputs: Sequence[Array], due: NDArray[np.intp]) -> DelayLine:
-        """A register of many samples as a delay line between instants; inputs: K of the different instants `due`."""
-        bit = self.form.timings.index(line.timing)
-        places = np.flatnonzero(self.instants.due >> bit & 1)
+    def _given(self, line: Line, places: NDArray[np.intp]) -> Array:
+        """What functions of time add to the values (nplaces, width) of a register of many samples."""
         read = _Chosen(self._signals, np.flatnonzero(line.from_w.any(axis=0)))
-        given = read.after(self.instants.times[places], self.tolerance).T @ line.from_w[:, read.columns].T
-        into = np.array([k[:, line.columns] for k in inputs])[due[places]]
-        return DelayLine(line.count, places, line.initial, line.from_z, given, into)
+        return read.after(self.instants.times[places], self.tolerance).T @ line.from_w[:, read.columns].T
 
-    def _forced(self) -> Array:
-        """Responses (nintervals, nx) of the flow to functions of time over each interval, from zero."""
+    def _forced(self) -> Array | None:
+        """Responses (nintervals, nx) of the flow to functions of time over each interval, from zero; None if all 0."""
         spans, n = self._spans, self.form.moving.size + self._held.size
-        found = np.zeros((self.instants.times.size, self.form.moving.size))
         if not self._fed.columns.size:
-            return found
+            return None
+        found = np.zeros((self.instants.times.size, self.form.moving.size))
         whole = np.flatnonzero(spans.whole)
         if spans.different.size <= _KINDS:
-            for k, change in enumerate(self._changes):
+            for k, change in enumerate(self._kernel.over(spans.different)):
                 own = whole[spans.kinds[whole] == k]
                 found[spans.interval[own]] = self._values[own] @ change[:, n:].T
         else:
+            changes = self._kernel.over(spans.different)
             for own in np.array_split(whole, 1 + whole.size // _TOGETHER):
-                change = self._changes[spans.kinds[own], :, n:]
+                change = changes[spans.kinds[own], :, n:]
                 found[spans.interval[own]] = np.matmul(change, self._values[own, :, None])[..., 0]
         found[spans.broken] = self._chained(np.zeros((spans.broken.size, n)))[1]
         return found
@@ -452,6 +438,12 @@ def _of_series(starts: Array, lengths: Array | float, held: Array, series: Array
     found[0] += held.T
     edge = np.ones(starts.size)
     return Cells(starts, lengths * edge, found, -edge, edge)
+
+
+def _vanishing(signals: Sequence[TimeSignal]) -> NDArray[np.bool_]:
+    """Which of the functions of time are always 0."""
+    flags = [np.full(signal.width, isinstance(signal, LateSignal) and signal.vanishes) for signal in signals]
+    return np.concatenate([np.zeros(0, dtype=np.bool_), *flags])
 
 
 class _Chosen:

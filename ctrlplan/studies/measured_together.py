@@ -15,7 +15,7 @@ from ctrlplan.studies.outcomes import Failed, tried
 
 T = TypeVar("T")
 
-_RUNS = 32
+_RUNS = 96
 """Maximum number of runs whose metrics are computed together."""
 
 _SAMPLES = 2**18

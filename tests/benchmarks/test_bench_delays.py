@@ -35,7 +35,6 @@ def loop(delays):
 def by_hand(delays, step):
     """Position at the times, by steps of fourth order."""
     count = round(T[-1] / step)
-    planned = 1.1 * PLAN(np.arange(2 * count + 1) * 0.5 * step)
     stages = [
         [] for _ in range(3)
     ]  # at the start, middle and end of a step: steps back, and factors of the interpolant
@@ -48,6 +47,7 @@ def by_hand(delays, step):
             stage[-1] += (GAINS[d] * step * s * (1.0 - s) ** 2, GAINS[d] * step * s * s * (s - 1.0))
 
     def run():
+        planned = 1.1 * PLAN(np.arange(2 * count + 1) * 0.5 * step)
         x, y, rates = np.zeros(3), [0.0] * (count + 2), [0.0] * (count + 2)
         for k in range(count):
             u = planned[2 * k : 2 * k + 3].tolist()

@@ -131,9 +131,9 @@ def instant_by_instant(first, second, offsets, delay=0.0):
             jump = np.array([sampled(*unit, numbers) for unit in units]).T
             maps[kind] = flow @ jump[:, :12], flow @ jump[:, 12], flow @ jump[:, 13], 2 in numbers, 0 in numbers
         kinds.append(maps[kind])
-    values = PLAN(marks).tolist()
 
     def run():
+        values = PLAN(marks).tolist()
         z, queue, out = np.zeros(12), deque(), np.empty((marks.size, 12))
         for j, (m, k, e, returns, taken) in enumerate(kinds):
             out[j] = z

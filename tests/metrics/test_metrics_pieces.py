@@ -235,6 +235,7 @@ def test_extrema_by_stretches_are_those_of_all_cubics(seed):
         f = np.exp(-decay * t) * np.cos(8.0 * pace * t) + (t > t[size // 2]) * (noise > 0.5)
         f += 0.3 * (noise > 0.7) * rng.standard_normal(f.shape)
         f[0] *= seed % 3
+        f[2:] += rng.choice([0.0, -7.0, 7.0], (2, 1))  # far from zero, as a torque about its bias
         edge = float(np.abs(f).max() * rng.uniform(0.01, 1.05))
         with np.errstate(divide="ignore", invalid="ignore"):
             cubics = [pieces(t, row) for row in f]
@@ -255,3 +256,15 @@ def test_extrema_by_stretches_are_those_of_all_cubics(seed):
             elif outside[0].size:
                 last = times[outside].max() - t[0]
                 assert 0.0 <= found - last <= np.diff(t).max() / 199.0
+
+
+@pytest.mark.parametrize("offset", [0.0, 7.0])
+@pytest.mark.parametrize("place", [126, 127, 128, 300, 400])
+def test_a_peak_between_samples_far_from_the_largest_sample(place, offset):
+    """Two parabolas in 600 samples: 1.0 at a sample, and 1.03 halfway between two samples of 0.98."""
+    t = np.arange(600.0)
+    f = np.maximum(1.0 - 0.2 * (t - 550.0) ** 2, 1.03 - 0.2 * (t - place - 0.5) ** 2).clip(0.0) + offset
+    assert f.max() == 1.0 + offset
+    with np.errstate(divide="ignore", invalid="ignore"):
+        assert maxima(t, f[None]) == pytest.approx(1.03 + offset, rel=1e-14)
+    assert metrics.peak(t, f) == pytest.approx(1.03 + offset, rel=1e-14)

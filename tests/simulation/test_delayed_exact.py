@@ -1,7 +1,9 @@
 """Exact responses of linear continuous loops with delays, compared with power series between marks in 32 digits."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal, localcontext
+from functools import partial
 from itertools import accumulate, pairwise
 from operator import mul
 
@@ -319,3 +321,34 @@ def test_the_unit_of_time_does_not_matter(unit):
     terms[1:] = [np.where(t > 0.0, own, 0.0) for own, t in zip(terms[1:], since[1:], strict=True)]
     assert found.method == "exact"
     assert np.abs(found.outputs - sum(terms)).max() <= 1e-13
+
+
+def test_runs_of_one_form_do_not_depend_on_earlier_ones():
+    """Cells are kept for runs with the same times; other plans, starts, ends and initial states, in threads as well."""
+    times = np.linspace(0.0, 6.0, 61)
+    plans = [cp.PolySpline([cp.Waypoint(t, 0, 0), cp.Waypoint(t + 1.5, 1, 0)], labels=["r"]) for t in (0.2, 0.45)]
+    runs = [
+        (t, plan, x) for plan in [*plans, 1.0, *plans] for t in (times, times[:40], 0.3 + times) for x in (1.0, 2.0)
+    ]
+
+    def outputs(loop, run):
+        return cp.simulate(loop, *run).outputs
+
+    expected = [outputs(two_delays(0.3, 0.50031, (-0.7, -0.4), integrated), run) for run in runs]
+    ready = cp.prepare(two_delays(0.3, 0.50031, (-0.7, -0.4), integrated))
+    with ThreadPoolExecutor(4) as pool:
+        found = [outputs(ready, run) for run in runs] + list(pool.map(partial(outputs, ready), runs))
+    assert all(np.array_equal(*pair) for pair in zip(found, 2 * expected, strict=True))
+
+
+def test_cells_are_computed_again_when_a_block_changes():
+    loop = two_delays(0.3, 0.50031, (-0.7, -0.4), integrated)
+    ready, times = cp.prepare(loop), np.linspace(0.0, 6.0, 61)
+    before = cp.simulate(ready, times, 1.0, 1.0).outputs
+    changed = next(block for block in loop.syslist if block.nstates)
+    changed.B[0, 0] *= 2.0
+    after = cp.simulate(ready, times, 1.0, 1.0).outputs
+    other = two_delays(0.3, 0.50031, (-0.7, -0.4), integrated)
+    next(block for block in other.syslist if block.nstates).B[0, 0] *= 2.0
+    assert np.array_equal(after, cp.simulate(other, times, 1.0, 1.0).outputs)
+    assert np.abs(after - before).max() > 1e-3

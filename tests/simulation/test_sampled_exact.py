@@ -1,6 +1,7 @@
 """Exact responses of linear loops with discrete blocks, compared with events in 50 digits."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import control as ct
@@ -341,3 +342,50 @@ def test_a_run_that_is_shorter_than_a_delay():
     found = cp.simulate(loop, [0.0, 0.4, 1.0], plan)
     assert found.method == "exact"
     assert np.abs(found.outputs - [[0.0, 0.8, 2.0], [2.0, 2.0, 2.0]]).max() <= 1e-15
+
+
+def late_loop(stiffness=-4.0, delay=0.105):
+    """Two rates; the delay is a register of 21 samples."""
+    blocks = [
+        plant([[0.0, 1.0], [stiffness, -0.8]]),
+        law(0.005, outputs="early"),
+        law(0.01, 0.003, name="d", outputs="d"),
+    ]
+    blocks.append(cp.create_delay_iosystem(delay, inputs="early", outputs="u"))
+    return ct.interconnect(blocks, inputs="r", outputs=["y0", "y1", "u"])
+
+
+def plans_and_times():
+    plan = plan_and_oracle()[0]
+    bent = cp.Step(1.0, labels=["r"])
+    return [(p, np.linspace(0.0, end, 301)) for end in (3.0, 1.5, 2.0, 3.0) for p in (plan, bent)]
+
+
+def test_runs_of_one_form_do_not_depend_on_earlier_ones():
+    ready = cp.prepare(late_loop())
+    for _ in range(2):
+        for plan, times in plans_and_times():
+            found, alone = cp.simulate(ready, times, plan), cp.simulate(late_loop(), times, plan)
+            assert np.array_equal(found.outputs, alone.outputs)
+            assert np.array_equal(found.states, alone.states)
+
+
+def test_steps_are_computed_again_when_a_block_changes():
+    loop = late_loop()
+    plan, times = plans_and_times()[0]
+    ready = cp.prepare(loop)
+    before = cp.simulate(ready, times, plan).outputs
+    loop.syslist[0].A[1, 0] = -5.0
+    after = cp.simulate(ready, times, plan).outputs
+    assert np.array_equal(after, cp.simulate(late_loop(-5.0), times, plan).outputs)
+    assert np.abs(after - before).max() > 1e-3
+
+
+def test_threads_share_the_steps_of_a_loop():
+    runs = plans_and_times()
+    expected = [cp.simulate(late_loop(), times, plan).outputs for plan, times in runs]
+    for _ in range(5):
+        ready = cp.prepare(late_loop())
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(lambda run, ready=ready: cp.simulate(ready, run[1], run[0]).outputs, runs))
+        assert all(np.array_equal(*pair) for pair in zip(found, expected, strict=True))
