@@ -222,9 +222,9 @@ class _Cells(NamedTuple):
     half: Array
 
     def divided(self, chosen: NDArray[np.bool_], maximum: int) -> _Cells:
-        """Chosen cells divided in two, or in eight if these are not more than a maximum."""
+        """Chosen cells divided in two, or in eight or 64 if these are not more than a maximum."""
         segment, centre, half = self.segment[chosen], self.centre[chosen], self.half[chosen]
-        parts = 8 if 8 * segment.size <= maximum else 2
+        parts = next((own for own in (64, 8) if own * segment.size <= maximum), 2)
         own = np.repeat(half / parts, parts)
         shares = np.arange(1 - parts, parts, 2)
         return _Cells(np.repeat(segment, parts), (np.repeat(centre, parts) + own * np.tile(shares, segment.size)), own)
@@ -238,14 +238,16 @@ class _Search:
         self.order = 2 if rope is None else max(2, rope.order + 1)
         self.durations = np.diff(plan.breakpoints)
         self.minimum = np.inf
-        begins, ends = plan.jet(plan.breakpoints[:-1], 0)[0], plan.jet(plan.breakpoints[1:], 0, left=True)[0]
-        scale = np.maximum(np.abs(begins), np.abs(ends)).max(axis=1)
+        every = np.arange(self.durations.size)
+        ends = np.concatenate([0.0 * self.durations, self.durations])
+        points = plan.segments_jet(np.concatenate([every, every]), ends, 0)[0]
+        scale = np.abs(points).max(axis=1)
         self._top = segment_bounds(plan, self.order + 1, scale / plan.duration ** (self.order + 1))
         if not np.isfinite(self._top).all():
             raise ValueError(f"derivatives must be finite to order {self.order + 1}, got inf or nan over the plan")
         self.size = float(scale.max())
-        for times, points in ((plan.breakpoints[:-1], begins), (plan.breakpoints[1:], ends)):
-            self._meet(times, points, np.stack([thing.distance(points) for thing in obstacles]) - load, "load")
+        times = np.concatenate([plan.breakpoints[:-1], plan.breakpoints[1:]])
+        self._meet(times, points, np.stack([thing.distance(points) for thing in obstacles]) - load, "load")
         if rope is not None:
             slopes = np.asarray(rope.slopes(plan), dtype=float)
             if slopes.shape != (rope.order + 1, 2) or not (np.isfinite(slopes).all() and np.all(slopes >= 0.0)):

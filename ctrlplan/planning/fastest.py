@@ -25,6 +25,7 @@ from ctrlplan.planning.path_law import FastLaw, Rates, fastest_law, fastest_smoo
 from ctrlplan.planning.path_law.positions import required_rate
 from ctrlplan.planning.path_law.signals import HIGHEST, fast_laws_of_signals, law_with_given_ends
 from ctrlplan.planning.path_law.vehicle import fastest_segment_law, orders_on_path
+from ctrlplan.planning.peaks import excess_at_peaks
 from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, bottom, scan
 from ctrlplan.planning.time_law import with_fast_time_law
@@ -731,10 +732,20 @@ def _is_over_time(bound: Bound) -> bool:
 def _at_its_limit(plan: Trajectory, limited: Limited) -> Fastest | None:
     """Plan of fixed shape near a duration at which its active limit is attained; None if not found in a few steps.
 
-    The duration is that at which the signal at the time of its extremum attains the
-    limit. If there is none nearby, the shortest plan found that satisfies the limits.
+    The duration is that at which the highest of the signals' peaks attains its limit,
+    then that at which the extremum of the whole plan does. If there is none nearby,
+    the shortest plan found that satisfies the limits.
     """
     best, longest = None, _SLOWED * plan.duration
+    at_peaks = excess_at_peaks(plan, limited)
+    factor = _nearest_root(lambda factor: at_peaks(factor) + 0.5 * _ACTIVE)
+    if factor is None:
+        factor = 1.0
+        if at_peaks(factor) > 0.0:
+            return None
+    if factor > _SLOWED:
+        return None
+    plan = plan.retime(factor * plan.duration)
     for _ in range(_EVALUATIONS):
         margins = limited.margins(plan)
         active = margins.active

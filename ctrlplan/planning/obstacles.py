@@ -5,13 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_number, checked_pair
-from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.common import Array, readonly
 
 
 @runtime_checkable
@@ -109,23 +110,36 @@ class Rectangle:
 
     def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
         """Minimum signed distance (...) on segments from p (2, ...) to q."""
-        a, b = np.broadcast_arrays(_plane(p, "p"), _plane(q, "q"))
+        a, b = _ends(p, q)
+        axes, signs, sides = self._sides
+        signs, sides = (own.reshape(-1, *[1] * (a.ndim - 1)) for own in (signs, sides))
+        first, last = signs * (a[axes] - sides), signs * (b[axes] - sides)
         outside = np.asarray(np.minimum(self.distance(a), self.distance(b)))
-        corners = list(itertools.product(*(filter(math.isfinite, sides) for sides in (self.x, self.z))))
-        if corners:
-            outside = np.asarray(np.minimum(outside, _to_segments(np.array(corners), a, b).min(axis=0)))
-        ends = [
-            (sign * (a[axis] - side), sign * (b[axis] - side))
-            for axis, sides in enumerate((self.x, self.z))
-            for sign, side in zip((-1.0, 1.0), sides, strict=True)
-            if math.isfinite(side)
-        ]
-        first, last = (np.stack(values) for values in zip(*ends, strict=True))
+        if self._corners.size:
+            outside = np.asarray(np.minimum(outside, _to_segments(self._corners, a, b).min(axis=0)))
         near = np.minimum(first, last).max(axis=0) <= 0.0  # not beyond one of the sides as a whole
         if near.any():
             depth = _lowest(first[:, near], last[:, near])
             outside[near] = np.where(depth > 0.0, outside[near], depth)
         return outside
+
+    @cached_property
+    def _corners(self) -> Array:
+        """Finite corners (ncorners, 2)."""
+        finite = [list(filter(math.isfinite, sides)) for sides in (self.x, self.z)]
+        return readonly(np.array(list(itertools.product(*finite)), dtype=float).reshape(-1, 2))
+
+    @cached_property
+    def _sides(self) -> tuple[NDArray[np.intp], Array, Array]:
+        """Axes, outward directions and positions (nsides,) of the finite sides."""
+        found = [
+            (axis, sign, side)
+            for axis, sides in enumerate((self.x, self.z))
+            for sign, side in zip((-1.0, 1.0), sides, strict=True)
+            if math.isfinite(side)
+        ]
+        axes, signs, sides = zip(*found, strict=True)
+        return np.array(axes), readonly(np.array(signs)), readonly(np.array(sides))
 
     def corners(self, margin: float) -> Array:
         """Corners of the enlarged rectangle, two for each corner."""
@@ -178,7 +192,7 @@ class Disc:
 
     def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
         """Minimum signed distance (...) on segments from p (2, ...) to q."""
-        a, b = np.broadcast_arrays(_plane(p, "p"), _plane(q, "q"))
+        a, b = _ends(p, q)
         return np.asarray(_to_segments(np.array([self.centre]), a, b)[0] - self.radius)
 
     def corners(self, margin: float) -> Array:
@@ -239,6 +253,15 @@ class HalfPlane:
         return np.empty((2, 0))
 
 
+def _ends(p: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
+    """Ends (2, ...) of segments, of the same shape."""
+    a, b = _plane(p, "p"), _plane(q, "q")
+    if a.shape == b.shape:
+        return a, b
+    a, b = np.broadcast_arrays(a, b)
+    return a, b
+
+
 def _plane(points: ArrayLike, name: str) -> Array:
     values = np.asarray(points, dtype=float)
     if values.ndim == 0 or len(values) != 2:
@@ -261,12 +284,19 @@ def _lowest(first: Array, last: Array) -> Array:
 
     From values at the ends: it is attained there or where two functions are equal.
     """
-    i, j = np.triu_indices(len(first), 1)
+    i, j = _pairs(len(first))
     gap, other = first[i] - first[j], last[j] - last[i]
     total = gap + other
-    share = np.clip(np.divide(gap, total, out=np.zeros_like(gap), where=total != 0.0), 0.0, 1.0)
+    share = np.divide(gap, total, out=np.zeros_like(gap), where=total != 0.0)
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
     equal = (first + share[:, None] * (last - first)).max(axis=1)
     return np.minimum(np.minimum(first.max(axis=0), last.max(axis=0)), equal.min(axis=0, initial=math.inf))
+
+
+@lru_cache(maxsize=16)
+def _pairs(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices (npairs,) of both members of all pairs."""
+    return np.triu_indices(count, 1)
 
 
 def _to_segments(points: Array, p: Array, q: Array) -> Array:
@@ -275,5 +305,5 @@ def _to_segments(points: Array, p: Array, q: Array) -> Array:
     along = q - p
     square = along[0] * along[0] + along[1] * along[1]
     share = np.divide(x * along[0] + z * along[1], square, out=np.zeros_like(x), where=square > 0.0)
-    share = np.clip(share, 0.0, 1.0)
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
     return np.asarray(np.hypot(x - share * along[0], z - share * along[1]))

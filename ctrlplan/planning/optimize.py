@@ -599,9 +599,15 @@ def _best_durations(problem: _Problem, given: Array, first: _Solution, weights: 
     starts = [given, *(chord**power for power in (1.0, 0.5, 1.0 / 3.0, 0.0))]
     shorts = [np.maximum(start / start.sum(), 2.0 * minimum) for start in starts]
     logs = [np.log(h / h.sum() - minimum) for h in shorts]
-    for x in sorted(logs, key=lambda x: objective(x)[0]):
+    at_start = {x.tobytes(): objective(x) for x in logs}
+
+    def known_at_start(x: Array) -> tuple[float, Array]:
+        return at_start.pop(x.tobytes(), None) or objective(x)
+
+    for x in sorted(logs, key=lambda x: at_start[x.tobytes()][0]):
         # Without a matrix of the size of the problem, whose products in threads would take most of the time.
-        result = minimize(objective, x, jac=True, method="L-BFGS-B", callback=stop_near_known, options=_LIMITED_MEMORY)
+        stop = stop_near_known if best else None
+        result = minimize(known_at_start, x, jac=True, method="L-BFGS-B", callback=stop, options=_LIMITED_MEMORY)
         best.append((float(result.fun), np.log(shares(result.x))))
     chosen = min(best, key=lambda pair: pair[0])[1]
     return minimum + room * np.exp(chosen)

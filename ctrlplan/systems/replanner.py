@@ -24,7 +24,16 @@ from ctrlplan.trajectories.extrema import stationary_times
 from ctrlplan.trajectories.files import signal_names
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.trajectory import check_end
-from ctrlplan.trajectories.transition import Transition, extrapolated, series, taylor_value, transition
+from ctrlplan.trajectories.transition import (
+    Transition,
+    coefficients_by,
+    extrapolated,
+    homing_matrix,
+    series,
+    taylor_value,
+    transition,
+    transition_matrix,
+)
 
 _ROUNDING, _MATTERS = 1e-12, 1e-6
 """Relative distances, in units of the move, above which a goal is new, and above which a missed one is an event."""
@@ -230,7 +239,7 @@ class _Horizons:
         # Maps from coefficients to jets one period later, from jets to coefficients with the goal reached at rest, and
         # from coefficients to those of such a fit one period later, if they are constant.
         self.step: Array | None = None
-        self.home: Array | None = None
+        self._home: Array | None = None
         self.again: Array | None = None
         self._start, self._end = plan.start, plan.end
         if self.shrinking:
@@ -241,8 +250,8 @@ class _Horizons:
                 f'min_horizon must be given with horizon = "shrinking" only, got {min_horizon} with {whole:g} s'
             )
         self.step, unit = self.whole.evaluation(period, order), np.eye(order + 1)
-        self.home = self.whole.coefficients(np.concatenate([unit, np.zeros_like(unit)]))
-        self.again = self.home @ self.step
+        self._home = self.whole.coefficients(np.concatenate([unit, np.zeros_like(unit)]))
+        self.again = self._home @ self.step
         radius = self.whole.radius(period)
         if not radius < 1.0:
             raise ValueError(
@@ -258,13 +267,26 @@ class _Horizons:
         """End time of a fit [s]."""
         return self._end if self.shrinking else t + self.whole.horizon
 
-    def at(self, t: float) -> Transition | None:
-        """Transition of a fit at a time not too close to the end of the plan; None before the plan."""
+    def remaining(self, t: float) -> float | None:
+        """Horizon [s] of a fit at a time not too close to the end of the plan; None before the plan."""
         if not self.shrinking:
-            return self.whole
-        if t < self._start:
-            return None
-        return transition(self.order, self._end - t, self.rate * (self._end - t))
+            return self.whole.horizon
+        return None if t < self._start else self._end - t
+
+    def transition(self, horizon: float) -> Transition:
+        """Transition of a fit over a horizon [s]."""
+        return transition(self.order, horizon, self.rate * horizon) if self.shrinking else self.whole
+
+    def home(self, horizon: float) -> Array | None:
+        """Matrix from jets to coefficients of a fit that reaches the plan's goal; None if it would lose digits."""
+        return homing_matrix(self.order, horizon, self.rate * horizon) if self.shrinking else self._home
+
+    def coefficients(self, horizon: float, jets: list[float], naxes: int) -> Array:
+        """Coefficients of a fit over a horizon [s], as `Transition.coefficients_of_row`."""
+        matrix = transition_matrix(self.order, horizon, self.rate * horizon) if self.shrinking else None
+        if matrix is None:
+            return self.transition(horizon).coefficients_of_row(jets)
+        return coefficients_by(matrix, jets, naxes)
 
 
 class _TriggerOver(NamedTuple):
@@ -417,14 +439,14 @@ class _Correction(SampledBlock):
             miss = self._distance(t, state, goal) if stopped else self._miss(t, state, goal) if goal else 0.0
             after[_UNREACHABLE] = 1.0 if late and miss > _MATTERS else 0.0
             due = due or miss > _ROUNDING
-        found = self._horizons.at(t) if due and not late else None
-        if found is None:
+        horizon = self._horizons.remaining(t) if due and not late else None
+        if horizon is None:
             return after
         if self._again is not None and not stopped and self._is_next(t, state):
             coefficients = self._again.dot(x[self._fitted].reshape(-1, self._naxes))
         else:
-            coefficients = self._coefficients(found, self._deviation(t, x, state, u, values), goal)
-        if self._limits and not self._within_limits(t, found, coefficients, goal):
+            coefficients = self._coefficients(horizon, self._deviation(t, x, state, u, values), goal)
+        if self._limits and not self._within_limits(t, self._horizons.transition(horizon), coefficients, goal):
             after[_UNREACHABLE] = 1.0
             return after
         after[_START], after[_END], after[_UNREACHABLE] = t, self._horizons.end(t), 0.0
@@ -436,13 +458,14 @@ class _Correction(SampledBlock):
             after[self._stopped] = 0.0
         return after
 
-    def _coefficients(self, found: Transition, begins: list[float], goal: list[list[float]]) -> Array:
+    def _coefficients(self, horizon: float, begins: list[float], goal: list[list[float]]) -> Array:
         """Coefficients of the correction from a jet, in one list, to the change of the goal."""
-        if not goal and found is self._horizons.whole and self._horizons.home is not None:
-            return self._horizons.home.dot(np.array(begins).reshape(-1, self._naxes))
-        changes = map(sub, itertools.chain.from_iterable(_extrapolated(goal, found.horizon)), self._arrival_row)
+        home = None if goal else self._horizons.home(horizon)
+        if home is not None:
+            return home.dot(np.array(begins).reshape(-1, self._naxes))
+        changes = map(sub, itertools.chain.from_iterable(_extrapolated(goal, horizon)), self._arrival_row)
         row = [*begins, *changes]
-        return found.coefficients_of_row(row + [0.0] * (2 * len(begins) - len(row)))
+        return self._horizons.coefficients(horizon, row + [0.0] * (2 * len(begins) - len(row)), self._naxes)
 
     def _is_stopped(self, x: list[float]) -> bool:
         """Whether the reference stops or has stopped."""

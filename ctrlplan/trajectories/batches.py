@@ -19,6 +19,9 @@ _HALVINGS, _ANYWHERE, _AT_KINKS = 40, 8, 64
 """Maximum number of times by which a segment is halved until interpolants resolve a derivative: about kinks, and
 anywhere, that is in more than so many pieces."""
 
+_FEW = 16
+"""Number of pieces up to which these are divided in eight: the time of an evaluation hardly depends on their number."""
+
 _QUARTERINGS = 26
 """Maximum number of times by which a piece is divided in four: to the resolution of its length."""
 
@@ -115,7 +118,8 @@ def _interpolated(plan: Segmented, nu: int, size: Array) -> _Pieces:
     durations = np.diff(plan.breakpoints)
     segment, first, width = np.arange(durations.size), np.zeros(durations.size), 1.0
     found: list[_Pieces] = []
-    for halving in range(_HALVINGS + 1):
+    halvings = 0
+    while segment.size:
         times = (first[:, None] + width * points(_DEGREE, 0.0, 1.0)) * durations[segment, None]
         jets = plan.segments_jet(np.repeat(segment, times.shape[1]), times.ravel(), nu)
         values = jets[nu].reshape(plan.naxes, *times.shape)
@@ -123,16 +127,16 @@ def _interpolated(plan: Segmented, nu: int, size: Array) -> _Pieces:
         series = transform(values)
         missed = np.abs(series[..., -3:]).max(axis=2)
         ready = (missed <= _RESOLVED * size[:, None]).all(axis=0)
-        if halving == _HALVINGS or (halving >= _ANYWHERE and ready.size - np.count_nonzero(ready) > _AT_KINKS):
+        left = ready.size - np.count_nonzero(ready)
+        if halvings >= _HALVINGS or (halvings >= _ANYWHERE and left > _AT_KINKS):
             ready[:] = True
         slack = missed[:, ready] + _ROUNDING * size[:, None]
         own = np.full(np.count_nonzero(ready), width)
         found.append(_Pieces(series[:, ready], slack, segment[ready], first[ready], own))
-        width *= 0.5
-        segment, first = np.repeat(segment[~ready], 2), np.repeat(first[~ready], 2)
-        first[1::2] += width
-        if not segment.size:
-            break
+        times_halved = 3 if left <= _FEW else 1
+        halvings, width, parts = halvings + times_halved, width / 2**times_halved, 2**times_halved
+        segment = np.repeat(segment[~ready], parts)
+        first = (first[~ready, None] + width * np.arange(parts)).ravel()
     return _Pieces(
         np.concatenate([own.series for own in found], axis=1),
         np.concatenate([own.slack for own in found], axis=1),

@@ -32,6 +32,9 @@ _DEEPEST = 50  # number of halvings of a segment to the resolution of floating-p
 _FIT = 32  # degree of an interpolant
 _CHECKS = 8  # minimum number of check points of a piece, none of them a node of its interpolant
 _ROUNDING = 8.0 * float(np.finfo(float).eps)
+_NEGLIGIBLE = (
+    1e-4 * TOLERANCE
+)  # sum of terms of an interpolant, relative to the magnitude, without which extrema are sought
 _PROPORTIONAL = 1e-13  # difference of intervals of two plans of the same shape, relative to them
 _TINY = float(np.finfo(float).tiny)
 
@@ -445,7 +448,7 @@ class _Search:
         flat = high - low <= 0.1 * TOLERANCE * scale
         short = level >= _DEEPEST
         split = (matters & ~(smooth | flat | short)).any(axis=0)
-        self._add(segments, times, series, matters & ~split, smooth)
+        self._add(segments, times, series, matters & ~split, smooth, scale)
         return split, float(rest[:, split].max(initial=0.0))
 
     def _add(
@@ -455,11 +458,12 @@ class _Search:
         series: Array,
         chosen: NDArray[np.bool_],
         smooth: NDArray[np.bool_],
+        scale: Array,
     ) -> None:
         """Add the candidates of pieces, at `times`, for the rows `chosen`: their ends and the roots of the slopes."""
         pieces = np.flatnonzero(chosen.any(axis=0))
         rows, of_smooth = np.nonzero(chosen & smooth)
-        which, roots = roots_of_rows(_slopes(series[rows, of_smooth]))
+        which, roots = roots_of_rows(_slopes(series[rows, of_smooth], scale[rows]))
         at_roots = of_smooth[which]
         first, last = times[:, _FIT + 1], times[:, _FIT + 2]
         whole = np.flatnonzero((chosen & ~smooth).any(axis=0))
@@ -584,12 +588,13 @@ def _evaluated(function: Callable[[Array], Array], jet: Array) -> Array:
     return values
 
 
-def _slopes(series: Array) -> Array:
-    """Derivatives of Chebyshev series (nrows, size) without the terms that are rounding, which only slow down roots."""
-    size = np.abs(series) * np.arange(series.shape[1]) ** 2
-    matters = size >= 1e-12 * size.max(axis=1, keepdims=True)
-    highest = series.shape[1] - 1 - matters[:, ::-1].argmax(axis=1)
-    return np.asarray(chebyshev.chebder(np.where(np.arange(series.shape[1]) <= highest[:, None], series, 0.0), axis=1))
+def _slopes(series: Array, scale: Array) -> Array:
+    """Derivatives of Chebyshev series (nrows, size) without the last terms, if negligible next to scales (nrows, 1).
+
+    Only the value at a root matters, and the time for the roots grows with the cube of the degree.
+    """
+    last = np.abs(series[:, ::-1]).cumsum(axis=1)[:, ::-1]
+    return np.asarray(chebyshev.chebder(np.where(last > _NEGLIGIBLE * scale, series, 0.0), axis=1))
 
 
 _SHARES = readonly(np.append(points(_FIT, 0.0, 1.0), [0.0, 1.0]))

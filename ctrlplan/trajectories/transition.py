@@ -73,25 +73,19 @@ class Transition(Displayed, Fields):
     alpha: float
     rate: float
     _family: _Family
-    _matrix: Array | None  # from jets, the position at the end relative to that at the start, to coefficients
+    _matrix: Array | None  # as `transition_matrix`
 
     def __init__(self, order: int, horizon: float, alpha: float = 0.0) -> None:
         order = checked_count(order, "order")
         horizon = checked_finite(horizon, "horizon", above=0.0)
         alpha = checked_alpha(alpha)
-        family = _family(order, alpha)
-        highest = 2.0 * order + 1.0
-        if not abs(highest * math.log10(horizon)) < _DECADES:
-            raise ValueError(
-                f"powers of the horizon must stay within floating point, got {horizon:g} s to the power {highest:g}"
-            )
         self._set_fields(
             order=order,
             horizon=horizon,
             alpha=alpha,
             rate=alpha / horizon,
-            _family=family,
-            _matrix=None if family.matrix is None else readonly(family.matrix * horizon**family.exponents),
+            _family=_family(order, alpha),
+            _matrix=transition_matrix(order, horizon, alpha),
         )
 
     def _describe(self) -> Iterator[Part]:
@@ -130,15 +124,10 @@ class Transition(Displayed, Fields):
         jets : sequence of float, length 2 (order + 1) naxes
             All axes of one derivative after another, at the start, then at the end.
         """
-        first = len(jets) // 2
-        naxes = first // (self.order + 1)
+        naxes = len(jets) // (2 * self.order + 2)
         if self._matrix is None:
             return self._carefully(np.array(jets).reshape(-1, naxes)[self._family.rows])
-        # Positions relative to the start, as in `NewtonSystem.coefficients`.
-        own = list(jets)
-        for axis in range(naxes):
-            own[first + axis] -= own[axis]
-        return self._matrix.dot(np.array(own).reshape(-1, naxes))
+        return coefficients_by(self._matrix, jets, naxes)
 
     def _carefully(self, data: Array) -> Array:
         """Coefficients with a check of their accuracy, from jets in the order of the system."""
@@ -219,6 +208,47 @@ def _family(order: int, alpha: float) -> _Family:
 def transition(order: int, horizon: float, alpha: float) -> Transition:
     """Cached transition: with a constant period the same horizons recur."""
     return Transition(order, horizon, alpha)
+
+
+@lru_cache(maxsize=4096)
+def transition_matrix(order: int, horizon: float, alpha: float) -> Array | None:
+    """Matrix from jets to coefficients of a transition, for `coefficients_by`; None if it loses digits.
+
+    Of shape (2 (order + 1), 2 (order + 1)). A matrix alone takes less time than a `Transition` where the horizon is new
+    in every fit.
+
+    Raises
+    ------
+    ValueError
+        If powers of the horizon exceed the range of floating-point numbers.
+    """
+    highest = 2.0 * order + 1.0
+    if not abs(highest * math.log10(horizon)) < _DECADES:
+        raise ValueError(
+            f"powers of the horizon must stay within floating point, got {horizon:g} s to the power {highest:g}"
+        )
+    family = _family(order, alpha)
+    return None if family.matrix is None else readonly(family.matrix * horizon**family.exponents)
+
+
+@lru_cache(maxsize=4096)
+def homing_matrix(order: int, horizon: float, alpha: float) -> Array | None:
+    """Matrix (2 (order + 1), order + 1) from jets at the start to coefficients of a transition to 0; None as above."""
+    matrix = transition_matrix(order, horizon, alpha)
+    if matrix is None:
+        return None
+    found = matrix[:, : order + 1].copy()
+    found[:, 0] -= matrix[:, order + 1]  # a position relative to that at the start
+    return readonly(found)
+
+
+def coefficients_by(matrix: Array, jets: Sequence[float], naxes: int) -> Array:
+    """Coefficients of a transition with a `transition_matrix`; as `Transition.coefficients_of_row`."""
+    # Positions relative to the start, as in `NewtonSystem.coefficients`.
+    own, first = list(jets), len(jets) // 2
+    for axis in range(naxes):
+        own[first + axis] -= own[axis]
+    return matrix.dot(np.array(own).reshape(-1, naxes))
 
 
 def series(rate: float, columns: Sequence[Sequence[Value]], past: Value, ahead: Value, order: int) -> list[list[Value]]:

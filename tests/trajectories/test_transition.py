@@ -13,7 +13,15 @@ from trajectory_oracle import Direct
 
 from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
 from ctrlplan.trajectories.newton import newton_series, pair_series
-from ctrlplan.trajectories.transition import Transition, extrapolated, series, transition
+from ctrlplan.trajectories.transition import (
+    Transition,
+    coefficients_by,
+    extrapolated,
+    homing_matrix,
+    series,
+    transition,
+    transition_matrix,
+)
 
 # Data drawn at random and every alpha: most of these plans swing, on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
@@ -91,6 +99,25 @@ def test_three_ways_to_its_values_agree(alpha):
 def test_a_transition_made_before_is_used_again():
     assert transition(2, 1.25, 0.5) is transition(2, 1.25, 0.5)
     assert (transition(2, 1.25, 0.5).horizon, transition(2, 1.25, 0.5).alpha) == (1.25, 0.5)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+def test_matrices_of_a_transition_to_zero_and_to_a_jet(alpha):
+    """Both against the spline solved in fifty digits."""
+    first, last, horizon = [0.3, -1.0, 0.5], [2.0, 0.4, -0.2], 1.7
+    for end in (last, [0.0] * 3):
+        wanted = direct(horizon, alpha, first, end).jet([0.6], 2)[:, 0]
+        found = [coefficients_by(transition_matrix(2, horizon, alpha), [*first, *end], 1)]
+        if not any(end):
+            found.append(homing_matrix(2, horizon, alpha) @ np.array(first)[:, None])
+        for coefficients in found:
+            rows = Transition(2, horizon, alpha).jet(coefficients, np.array([0.6]), 2)[:, 0, 0]
+            np.testing.assert_allclose(rows, wanted, rtol=1e-11, atol=1e-12)
+
+
+def test_matrices_that_would_lose_digits_are_none():
+    assert transition_matrix(2, 1.0, 6.28) is None
+    assert homing_matrix(2, 1.0, 6.28) is None
 
 
 # What is kept when a spline is fitted again on what remains: the angular frequency alpha/duration and, where the

@@ -56,6 +56,8 @@ class Problem:
         Limits; lower ones of the first rows.
     trust : float, optional
         Largest ratio of a coefficient to that of the start, and of its reciprocal.
+    accuracy : float, optional
+        Distance from the inequalities, relative to the limits, up to which they hold.
     """
 
     spline: Spline
@@ -65,6 +67,7 @@ class Problem:
     upper: Array
     lower: Array
     trust: float = math.inf
+    accuracy: float = 1e-9
 
     def duration(self, x: Array) -> float:
         """Duration [s] with given coefficients."""
@@ -109,6 +112,7 @@ class _Search:
         self._index, self._size, self._bandwidth = spline.index, spline.size, spline.bandwidth
         self._fixed, self._scale = spline.fixed, np.where(spline.fixed, 1.0, start)
         self._floor, self._ceiling = 1.0 / problem.trust, min(problem.trust, _FAR)
+        self._accuracy = problem.accuracy
         self._start = np.where(spline.fixed, start, 1.0)
         own = self._scale[spline.index]
         self._points, self._weights = problem.points * own[:, None], problem.weights
@@ -126,12 +130,14 @@ class _Search:
         active: Array = np.concatenate([np.ones(w.size - 2 * x.size), free, free])
         # At the optimum the sum of the multipliers of normalised limits is half the duration.
         y = active * 0.5 * self._duration(x) / (active / w).sum() / w
+        step = np.ones(x.size)
         for _ in range(_ROUNDS):
             gradient, curvature = self._objective(x)
             missed = self._slacks(x) - w
             gap, tolerance = float(y @ w), _GAP * self._duration(x)
-            residual = np.where(self._fixed, 0.0, x * (gradient - self._pulled(y)))
-            if gap < tolerance and np.abs(residual).sum() < tolerance and missed.min() > -1e-9:
+            # Without a duality gap the duration decreases at most by the residual times the remaining step.
+            residual = free * step * (gradient - self._pulled(y))
+            if gap < tolerance and np.abs(residual).sum() < tolerance and missed.min() > -self._accuracy:
                 return self._scale * x
             try:
                 solve = self._solver(curvature, y / w)
@@ -148,8 +154,9 @@ class _Search:
             dw = self._changes(dx) + missed
             dy = (target - y * dw) / w - y
             primal, dual = (min(1.0, _STEP * _longest(own, change, 2.0)) for own, change in ((w, dw), (y, dy)))
+            step = np.abs(dx)
             x, w, y = x + primal * dx, w + primal * dw, y + dual * dy
-        if not missed.min() > -1e-9:
+        if not missed.min() > -self._accuracy:
             self._raise_infeasible()
         return self._scale * x
 

@@ -68,10 +68,13 @@ _STEP = 1e-6
 _RESERVE = 1e-4
 """Distance from limits, relative to their scale, for points between those of the cells."""
 
+_ACCURACY = 0.1 * _RESERVE
+"""Distance from the linearised limits up to which they hold."""
+
 _TIGHTENINGS = 6
 """Maximum number of times by which limits are tightened in cells that violate them between the points."""
 
-_ALLOWED = (3e-4, -1e-4, -1e-3)
+_ALLOWED = (3e-4, -5e-5, -1e-3)
 """Violations between the points of laws, one after the other until one satisfies the limits or is slowed to do so."""
 
 _ROUNDING = 1e-12
@@ -260,7 +263,7 @@ class _Problems:
         for _ in range(rounds):
             try:
                 rows = self._signals.rows(self._spline.coefficients(x), reserves)
-                problem = replace(problem_of(self._grid, self._spline, rows), trust=trust)
+                problem = replace(problem_of(self._grid, self._spline, rows), trust=trust, accuracy=_ACCURACY)
                 tried = minimum(problem, x)
             except ValueError:  # the linearised limits cannot be satisfied near this solution
                 x, trust = best, trust**0.4 if solved else 4.0 * trust
@@ -273,9 +276,10 @@ class _Problems:
                 continue
             penalty = 1.0 + _PENALTY * max(beyond, 0.0)
             promised, gain = 1.0 - own / duration, 1.0 - own * penalty / duration
+            changed = abs(own / problem.duration(x) - 1.0)
             if gain > 0.0:
                 best, duration = tried, own * penalty
-            if (penalty < 1.0 + _GAIN and abs(gain) < _GAIN and trust > _SETTLED) or trust < 1.001:
+            if (penalty < 1.0 + _GAIN and changed < _GAIN and trust > _SETTLED) or trust < 1.001:
                 break
             x = tried if penalty < _NEAR and gain > -_WORSE else best
             trust = (
