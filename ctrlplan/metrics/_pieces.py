@@ -502,11 +502,6 @@ def _bent(base: Array, third: Array, early: Array, step: Array) -> tuple[Array, 
     return (base + early * third) * square - d, d
 
 
-def places(chosen: NDArray[np.bool_]) -> Places:
-    """Return the rows and columns of the few true entries of an array (nrows, ncolumns)."""
-    return tuple(np.divmod(np.flatnonzero(chosen), chosen.shape[1]))
-
-
 def together(near: Sequence[Near]) -> Near:
     """Return the columns of all blocks of signals."""
     return tuple(np.concatenate(column) for column in zip(*near, strict=True))

@@ -937,7 +937,8 @@ class Pattern:
     @cached_property
     def cosines(self) -> Array:
         """Reduction of sums 2 and 3 by powers of cosines, (order - 1, nwaypoints, nconstraints)."""
-        factors, orders = _factors(len(self.at))[:, 0], np.arange(self.order - 1)[:, None, None]
+        number, orders = np.arange(float(len(self.at))), np.arange(self.order - 1)[:, None, None]
+        factors = number + number % 2.0  # of each function
         return readonly((3.0 * factors - 2.0 * (orders + self.zeros)) / 6.0)
 
 
