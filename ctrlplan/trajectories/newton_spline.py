@@ -280,8 +280,9 @@ class NewtonSpline(WaypointSpline):
             return given
         known, key = self._end_jets, (segment, s, order)
         if key not in known:
+            rows = self._rows_inside(s, order)
             with np.errstate(over="ignore", invalid="ignore"):
-                found = self._jet(np.array([s]), max(order, 3))[: order + 1, :, 0]
+                found = np.array(rows).T if rows else self._jet(np.array([s]), order)[:, :, 0]
             found[: len(given)] = np.where(np.isnan(given), found[: len(given)], given)
             known[key] = readonly(found)
         return known[key]
@@ -291,6 +292,10 @@ class NewtonSpline(WaypointSpline):
         if s == 0.0 or s == self._moments[1] - self._moments[0]:
             ends: list[list[float]] = self._end_jet(segment, s, order).T.tolist()
             return ends
+        return self._rows_inside(s, order)
+
+    def _rows_inside(self, s: float, order: int) -> list[list[float]] | None:
+        """The same, without the entries at the ends."""
         if not is_moderate(self._duration, order):
             return None
         parts, u = self._columns, s / self._duration
