@@ -107,17 +107,21 @@ class NumericalMethod(Protocol[S]):
     def check(self, attempt: Attempt[S]) -> None:
         """Raise if the result of an attempt is not valid."""
 
+
+class History(Protocol[S]):
+    """What earlier runs of the same equations required."""
+
     def expects_closer_states(self, attempt: Attempt[S]) -> bool:
-        """Whether a run of the same equations had to be repeated with closer states."""
+        """Whether a run had to be repeated with closer states."""
 
     def expect_closer_states(self, attempt: Attempt[S]) -> None:
-        """Note that an attempt had to be repeated with closer states."""
+        """Note that an attempt has to be repeated with closer states."""
 
 
-def numerical(job: Job, method: NumericalMethod[S]) -> Record:
+def numerical(job: Job, method: NumericalMethod[S], history: History[S] | None = None) -> Record:
     """Record of a numerical run, repeated with the scales of the states and if its accuracy requires it."""
     fresh = fresh_job(job)
-    attempt = _first(job, method)
+    attempt = _first(job, method, history)
     scales = attempt.scales
     for _ in range(PASSES - 1 if job.atol is None else 0):
         found = scales.renewed(attempt.hull, attempt.moving, attempt.noise, attempt.passed_on)
@@ -132,14 +136,14 @@ def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     if job.atol is None and attempt.expands():
         attempt = _tightened(attempt, fresh)
     if attempt.tighter == 1.0:
-        attempt = _with_closer_states(attempt, fresh)
+        attempt = _with_closer_states(attempt, fresh, history)
     return attempt.record()
 
 
-def _first(job: Job, method: NumericalMethod[S]) -> Attempt[S]:
-    """First run, with closer states if those of the same equations required them before."""
+def _first(job: Job, method: NumericalMethod[S], history: History[S] | None) -> Attempt[S]:
+    """First run, with closer states if one of the same equations required them before."""
     attempt = Attempt(job, method, Scales.plain(job.state.size, job.atol))
-    if method.expects_closer_states(attempt):
+    if history is not None and history.expects_closer_states(attempt):
         closer = Attempt(fresh_job(job), method, attempt.scales.closer())
         with suppress(SolverError):
             closer.go()
@@ -178,12 +182,13 @@ def _tightened(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
     return found
 
 
-def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
+def _with_closer_states(attempt: Attempt[S], fresh: Job, history: History[S] | None) -> Attempt[S]:
     """Run repeated with tighter tolerances of large states if others depend on their absolute error, as on an angle."""
     loose = attempt.loose()
     if not loose.any():
         return attempt
-    attempt.method.expect_closer_states(attempt)
+    if history is not None:
+        history.expect_closer_states(attempt)
     try:
         scales = attempt.scales.with_closer_states(
             attempt.hull,

@@ -54,9 +54,9 @@ class CompiledMethod:
         fresh = fresh_job(job)
         with passing_interruptions():
             try:
-                return numerical(job, self)
+                return numerical(job, self, self)
             except DisagreementError:  # an object used by a function may have changed since it was traced
-                return numerical(fresh, self)
+                return numerical(fresh, self, self)
 
     def solver(self, attempt: Attempt[CompiledSolver]) -> CompiledSolver:
         """CVODES on the compiled form."""

@@ -38,13 +38,6 @@ class Python:
     def check(self, attempt: Attempt[NumericalSolver]) -> None:
         """Nothing to check: the equations are not compiled."""
 
-    def expects_closer_states(self, attempt: Attempt[NumericalSolver]) -> bool:
-        """No: the equations of other runs are not known to be the same."""
-        return False
-
-    def expect_closer_states(self, attempt: Attempt[NumericalSolver]) -> None:
-        """Nothing is noted."""
-
 
 def _check_repeatable(attempt: Attempt[NumericalSolver]) -> None:
     """Raise if state derivatives are random: such a loop has no solution."""
