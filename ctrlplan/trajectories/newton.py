@@ -601,8 +601,9 @@ class NewtonSystem(Fields):
         ranges, columns = self._swings, coefficients.T.tolist()
         if count == 2:  # the second coefficient is the difference of the positions
             return all([-math.inf < sum(map(mul, ranges, map(abs, column))) <= 0.0 for column in columns])
-        rows = zip(columns, values[:count].T.tolist(), strict=True)
-        return all([sum(map(mul, ranges, map(abs, c))) <= MAXIMUM_SWING * (max(y) - min(y)) for c, y in rows])
+        allowed = [MAXIMUM_SWING * (max(row) - min(row)) for row in values[:count].T.tolist()]
+        rows = zip(columns, allowed, strict=True)
+        return all([sum(map(mul, ranges, map(abs, column))) <= limit < math.inf for column, limit in rows])
 
     @cached_property
     def amplification(self) -> float:

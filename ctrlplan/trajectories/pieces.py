@@ -144,8 +144,8 @@ class Form:
     def coefficients(self, rows: NDArray[Any]) -> Array:
         """Coefficients (size, naxes, nsegments) from entries (naxes, size, nwaypoints)."""
         system = self.system
-        data = self._taylor_data(rows)
         with np.errstate(over="ignore", invalid="ignore"):
+            data = self._taylor_data(rows)
             if self.is_careful:
                 found = self._carefully_solved(rows.astype(float, copy=False), data.astype(float, copy=False))
             else:

@@ -388,9 +388,9 @@ class PiecewiseSpline(WaypointSpline):
             ends = np.full((self.naxes, 2), [np.inf, -np.inf])
             for pieces in self._pieces:
                 for run in pieces.runs:
-                    low, high = _range(run, slice(None))
-                    axes = list(pieces.axes)
-                    ends[axes] = np.stack([np.minimum(ends[axes, 0], low), np.maximum(ends[axes, 1], high)], axis=1)
+                    for k, axis in enumerate(pieces.axes):
+                        low, high = _range(run, k, slice(None))
+                        ends[axis] = np.minimum(ends[axis, 0], low), np.maximum(ends[axis, 1], high)
             remedy = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
             remedy += ", or use fit for samples"
             warn_of_swing(ends, self._entries.times, self._entries.table, self.end, self.labels, remedy)
@@ -417,20 +417,13 @@ class PiecewiseSpline(WaypointSpline):
                 sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
                 bounds = (weights @ sizes).reshape(len(pieces.axes), -1)
                 highest = np.maximum.reduce(bounds, axis=1).tolist()
-                if all([bound <= _ROOM * spans[axis] for axis, bound in zip(pieces.axes, highest, strict=True)]):
-                    continue
-                if not self._values_stay_near(run, list(pieces.axes), bounds):
-                    return False
+                for k, axis in enumerate(pieces.axes):
+                    allowed, own = _ROOM * spans[axis], positions[axis]
+                    if not highest[k] <= allowed:
+                        low, high = _range(run, k, np.flatnonzero(~(bounds[k] <= allowed)))
+                        if not (low >= own.min() - allowed and high <= own.max() + allowed):
+                            return False
         return True
-
-    def _values_stay_near(self, run: Run, axes: list[int], bounds: Array) -> bool:
-        """The same by values where the bounds (naxes, nsegments) of what is added are too large."""
-        positions = self._entries.rows[axes, 0]
-        lowest, highest = np.minimum.reduce(positions, axis=1), np.maximum.reduce(positions, axis=1)
-        allowed = _ROOM * (highest - lowest)
-        near = (bounds <= allowed[:, None]).all(axis=0)
-        low, high = _range(run, np.flatnonzero(~near))
-        return bool(((low >= lowest - allowed) & (high <= highest + allowed)).all())
 
     def _is_small(self, spans: list[float]) -> bool:
         """Whether the coefficients of all axes and segments together are small next to the range of each axis.
@@ -635,20 +628,18 @@ class PiecewiseSpline(WaypointSpline):
 
 
 def _spans(positions: Array) -> list[float]:
-    """Ranges of positions (naxes, nwaypoints) that are prescribed, not above 0 if one is free."""
+    """Ranges of positions (naxes, nwaypoints), nan for an axis with a free one."""
     if positions.size > _FEW_POSITIONS:
         found: list[float] = (np.maximum.reduce(positions, axis=1) - np.minimum.reduce(positions, axis=1)).tolist()
         return found
     # The sum is nan if a position is free.
-    return [max(own) - min(own) if sum(own) < math.inf else 0.0 for own in positions.tolist()]
+    return [max(own) - min(own) if sum(own) < math.inf else math.nan for own in positions.tolist()]
 
 
-def _range(run: Run, segments: slice | NDArray[np.intp]) -> tuple[Array, Array]:
-    """Minimum and maximum (naxes,) in some segments of a run, on a grid."""
-    coefficients = run.coefficients[:, :, segments]
-    found = run.system.functions.T @ coefficients.reshape(run.system.size, -1)
-    values = found.reshape(-1, *coefficients.shape[1:])
-    return values.min(axis=(0, 2)), values.max(axis=(0, 2))
+def _range(run: Run, axis: int, segments: slice | NDArray[np.intp]) -> tuple[float, float]:
+    """Minimum and maximum of one of the axes in some segments of a run, on a grid."""
+    values = run.system.functions.T @ run.coefficients[:, axis, segments]
+    return float(values.min()), float(values.max())
 
 
 def _checked_times(times: ArrayLike) -> Array:

@@ -174,6 +174,50 @@ def test_the_bound_lets_no_swing_pass(alpha):
             assert bool(caught) == (swing > 3.0), swing
 
 
+@pytest.mark.parametrize("alpha", [0.0, 1.0, 3.1])
+def test_the_bounds_of_piecewise_splines_let_no_swing_pass(alpha):
+    """Where a swing is excluded, the range at 301 times a segment is at most 3 times that of the positions."""
+    rng = np.random.default_rng(3)
+    decided = [0, 0]
+    for case in range(200):
+        n, naxes = 2 + case % 6, 1 + case % 3
+        times = np.cumsum(rng.uniform(0.3, 2.0, n))
+        rows = rng.normal(size=(naxes, 3, n)) * rng.choice([0.03, 0.3, 3.0], (1, 3, 1))
+        if case % 2:
+            rows[:, 1:, 1:-1] = np.nan
+        plan = PiecewiseSpline.from_arrays(
+            times, rows[:, 0], derivatives={1: rows[:, 1], 2: rows[:, 2]}, alpha=alpha, warn=False
+        )
+        spans = np.ptp(rows[:, 0], axis=1)
+        values = plan(np.linspace(times[0], times[-1], 300 * (n - 1) + 1)).reshape(naxes, -1)
+        excluded = plan._is_small(spans.tolist()), plan._stays_near()
+        if any(excluded):
+            assert (np.ptp(values, axis=1) <= 3.0 * spans).all()
+        decided = [count + own for count, own in zip(decided, excluded, strict=True)]
+    assert decided[0] > 5 or alpha > 3.0
+    assert decided[0] < decided[1] < 200
+
+
+def test_a_plan_with_a_free_position_is_measured(monkeypatch):
+    """Along a line: what is added to it is 0, but it leads further than the positions that are prescribed."""
+    measured = []
+    monkeypatch.setattr(piecewise, "warn_of_swing", lambda *given: measured.append(given))
+    for count in (4, 60):
+        points = [Waypoint(float(k), k if k else np.nan, 1) for k in range(count)]
+        assert float(PiecewiseSpline(points)(0.0)) == pytest.approx(0.0, abs=1e-12)
+    assert len(measured) == 2
+
+
+@pytest.mark.parametrize("warn", [True, False])
+@pytest.mark.parametrize(
+    "make", [PolySpline, lambda points, warn: TrigSpline(points, alpha=2.0, warn=warn), PiecewiseSpline]
+)
+def test_coefficients_that_overflow_are_rejected_with_and_without_the_check(make, warn):
+    points = [Waypoint(0, 0, 1e300, 0), Waypoint(1e10, 1, 0, 0)]
+    with pytest.raises(ValueError, match="within floating point"):
+        make(points, warn=warn)
+
+
 @pytest.mark.parametrize("make", [PolySpline, lambda points: TrigSpline(points, alpha=2.0), PiecewiseSpline])
 def test_moves_from_rest_to_rest_are_decided_by_the_bound(make, monkeypatch):
     def measured(*_given):
