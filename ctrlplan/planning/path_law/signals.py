@@ -74,7 +74,7 @@ _ACCURACY = 0.1 * _RESERVE
 _TIGHTENINGS = 6
 """Maximum number of times by which limits are tightened in cells that violate them between the points."""
 
-_ALLOWED = (3e-4, -5e-5, -1e-3)
+_ALLOWED = (1e-4, -5e-5, -1e-3)
 """Violations between the points of laws, one after the other until one satisfies the limits or is slowed to do so."""
 
 _ROUNDING = 1e-12
