@@ -161,7 +161,8 @@ class LoopForm:
         t, z, count = schur(self.a, output="real", sort=lambda re, im: bool(np.hypot(re, im) <= limit))
         if count != m:
             raise ValueError(f"integrators of {self.name} must be separable from its slow poles, got {count} of {m}")
-        y = solve_sylvester(t[:m, :m], -t[m:, m:], -t[:m, m:])
+        # Some releases of scipy reject equations without unknowns.
+        y = solve_sylvester(t[:m, :m], -t[m:, m:], -t[:m, m:]) if m < n else np.zeros((n, 0))
         return z[:, :m], z[:, :m].T - y @ z[:, m:].T, z[:, :m] @ y + z[:, m:], z[:, m:].T
 
     @cached_property

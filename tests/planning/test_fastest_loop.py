@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from loop_oracle import QUINTIC, S_CURVE, SEPTIC, VIA, random_loop, responses, system_of
 from repetitions import one_in
+from scipy.integrate import trapezoid
 
 import ctrlplan as cp
 from ctrlplan import Waypoint
@@ -195,7 +196,7 @@ def test_root_mean_square_with_a_value():
     found = cp.fastest(QUINTIC, {"v": cp.Limits(rms=3.0), "y": (None, 1.05)}, loop)
     times = np.linspace(0.0, found.duration, 100_001)
     v = cp.simulate(loop, times, found.plan).outputs["v"]
-    assert math.sqrt(np.trapezoid(v**2, times) / found.duration) == pytest.approx(3.0, rel=1e-8)
+    assert math.sqrt(trapezoid(v**2, times) / found.duration) == pytest.approx(3.0, rel=1e-8)
     assert found.active.bound.name == "RMS of v"
     assert "RMS of v evaluated at durations at most" in found.statement
     alone = cp.fastest(QUINTIC, {"y": (None, 1.05)}, loop)
@@ -286,7 +287,7 @@ def test_hardly_damped_mode(damping):
 
     def amplitude(duration):  # |int r'(t) e^(i w t) dt|, of a quintic
         t = np.linspace(0.0, duration, 20_001)
-        return abs(np.trapezoid(QUINTIC.retime(duration)(t, 1) * np.exp(1j * w * t), t))
+        return abs(trapezoid(QUINTIC.retime(duration)(t, 1) * np.exp(1j * w * t), t))
 
     assert amplitude(found.duration) == pytest.approx(0.01, rel=20.0 * damping + 1e-6)
     assert found.active.bound.name == "y"

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from loop_oracle import QUINTIC, S_CURVE, SEPTIC, VIA, random_loop, responses, system_of
+from scipy.integrate import trapezoid
 from scipy.linalg import expm
 
 import ctrlplan as cp
@@ -78,8 +79,8 @@ def test_envelope_and_its_moments_by_quadrature():
     values = np.array(values)
     later = np.maximum.accumulate(values[::-1])[::-1]
     for power in range(3):
-        exact = np.trapezoid(values * times**power, times)
-        smallest = np.trapezoid(later * times**power, times)
+        exact = trapezoid(values * times**power, times)
+        smallest = trapezoid(later * times**power, times)
         found = float(envelope.moment(power, np.array([20.0]))[0, 0, 0])
         assert exact < found
         assert smallest <= found * (1 + 1e-6) <= 1.5 * smallest

@@ -5,6 +5,7 @@ import math
 import control as ct
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 import ctrlplan as cp
 
@@ -191,7 +192,7 @@ def test_zv_cancels_the_phase_of_the_measured_frequency():
     assert np.count_nonzero(weights) == 3
     mode, total = zeta + 1j * math.sqrt(1.0 - zeta**2), 0.0
     for lag in range(40):
-        turned = np.trapezoid(frequency[now - lag : now + 1], dx=DT)
+        turned = trapezoid(frequency[now - lag : now + 1], dx=DT)
         total += weights[lag] * math.sqrt(frequency[now - lag] / frequency[now]) * np.exp(mode * turned)
     assert abs(total) <= 1e-13
 

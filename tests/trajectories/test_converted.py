@@ -40,7 +40,8 @@ def test_spline_has_the_values_and_derivatives_of_scipy(name):
     plan = cp.as_trajectory(spline)
     t = np.append(RNG.uniform(plan.start, plan.end, 60), plan.breakpoints[:-1])
     for nu in range(4):
-        wanted = spline(t, nu=nu)
+        # Some releases of scipy write out of bounds where a B-spline is derived more often than its degree.
+        wanted = 0.0 * spline(t) if nu > getattr(spline, "k", nu) else spline(t, nu=nu)
         wanted = wanted if wanted.ndim == 1 or "last" in name else wanted.T
         np.testing.assert_allclose(plan(t, nu), wanted, rtol=0, atol=1e-12 * max(1.0, np.abs(wanted).max()))
     assert not plan.deviation.any()
