@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import linprog, nnls
+from scipy.optimize import linprog, lsq_linear, nnls
 
 from ctrlplan._types import Array
 
@@ -91,8 +91,16 @@ def _step(terms: Array, rooms: Array, by_terms: Array, by_rooms: Array, reach: f
     # A problem LDP of Lawson and Hanson (Solving Least Squares Problems, chapter 23) with y = r (d - solved):
     # min |y|^2 subject to rows d >= sides.
     g, h = np.linalg.solve(r.T, rows.T), sides - rows @ solved
-    u = nnls(np.vstack([g, h]), np.append(np.zeros(count), 1.0), maxiter=50 * len(h))[0]
+    u = _least_squares(np.vstack([g, h]), np.append(np.zeros(count), 1.0))
     residual = np.append(g @ u, h @ u - 1.0)
     if not -residual[-1] > 0.0:
         return np.zeros(count)
     return np.asarray(np.clip(solved - np.linalg.solve(r, residual[:-1]) / residual[-1], -reach, reach))
+
+
+def _least_squares(matrix: Array, right: Array) -> Array:
+    """Unknowns of at least 0 with the smallest squares of ``matrix @ u - right``."""
+    try:
+        return np.asarray(nnls(matrix, right, maxiter=50 * matrix.shape[1])[0])
+    except RuntimeError:  # releases of scipy that solve normal equations may not end
+        return np.asarray(lsq_linear(matrix, right, (0.0, np.inf), method="bvls", tol=1e-14).x)

@@ -245,9 +245,9 @@ def _by_elements(ufunc: np.ufunc, method: str, inputs: Sequence[Value], kwargs: 
             raise TypeError(f"options of np.{ufunc.__name__} cannot be traced")
         if method == "reduce" and "axis" not in options:
             options["axis"] = kwargs.get("axis", 0)
-        found = getattr(np.frompyfunc(operation, len(inputs) if method == "__call__" else 2, 1), method)(
-            *plain, **options
-        )
+        vectorized = np.frompyfunc(operation, len(inputs) if method == "__call__" else 2, 1)
+        with np.errstate(all="ignore"):  # numpy 1 warns of floating-point flags that are set by the way
+            found = getattr(vectorized, method)(*plain, **options)
     if out is None:
         return _wrapped(found)
     out[0][...] = _plain(found)

@@ -11,7 +11,7 @@ from natural import NaturalCubic
 from repetitions import one_in
 
 import ctrlplan as cp
-from ctrlplan.planning import plan_length
+from ctrlplan.planning import inequalities, plan_length
 from ctrlplan.planning.avoid import avoid
 from ctrlplan.planning.clearance import clearance
 from ctrlplan.planning.obstacles import Disc, HalfPlane, Rectangle
@@ -461,3 +461,19 @@ def test_a_result_says_nothing_where_it_is_used_as_one():
     assert repr(found)
     with pytest.raises(AttributeError, match="an Avoidance has the attributes plan and clearance, got 'way'"):
         found.way  # noqa: B018
+
+
+def test_least_squares_that_do_not_end_are_solved_otherwise(monkeypatch):
+    """Some releases of scipy solve normal equations and give up: the plan is the same."""
+    obstacles, crane = [Disc((10.0, 5.0), 1.0)], Crane()
+    move = cp.PolySpline([cp.Waypoint(0, [0, 10], 0, 0, 0, 0), cp.Waypoint(16, [20, 11], 0, 0, 0, 0)])
+    expected = avoid(move, obstacles, clearance=0.2, rope=crane.rope()).plan
+
+    def endless(matrix, right, maxiter):
+        raise RuntimeError("Maximum number of iterations reached.")
+
+    monkeypatch.setattr(inequalities, "nnls", endless)
+    found = avoid(move, obstacles, clearance=0.2, rope=crane.rope()).plan
+    assert [point.time for point in found.waypoints] == pytest.approx([point.time for point in expected.waypoints])
+    times = np.linspace(0.0, 16.0, 101)
+    np.testing.assert_allclose(found(times), expected(times), rtol=0, atol=1e-5)
