@@ -441,7 +441,10 @@ class InterpretedSolver:
         rates.begin(_PASSING if kind is RK45 else _CALLS)
         # Equations that depend on time are evaluated at least once per sample: no longer pulse is skipped.
         longest = float(np.diff(grid, prepend=rates.left).max()) if self._bounded else math.inf
-        solver = kind(rates, t, z, right, rtol=self._rtol[self._moving], atol=self._atol, max_step=longest)
+        rtol = self._rtol[self._moving]
+        # BDF takes one relative tolerance for all states.
+        own = float(rtol.min()) if kind is BDF else rtol
+        solver = kind(rates, t, z, right, rtol=own, atol=self._atol, max_step=longest)
         if isinstance(solver, LSODA):
             _raise_failures(solver)
         while solver.status == "running":

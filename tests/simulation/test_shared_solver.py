@@ -47,3 +47,12 @@ def test_the_only_lsoda_is_held_by_one_run_and_given_back(monkeypatch, shared):
         assert np.abs(run(2.0) - 1.0 / (1.0 + 2.0 * T)).max() < 1e-6
     with interpreted._implicit() as again:
         assert again.__name__ == "LSODA"
+
+
+def test_the_other_solver_takes_several_states(monkeypatch):
+    """An oscillator from (1, 0): cos t and -sin t."""
+    monkeypatch.setattr(interpreted, "_SHARED", True)
+    loop = ct.nlsys(lambda t, x, u, p: [x[1], -x[0]], None, inputs=0, outputs=2, states=2, name="oscillator")
+    with interpreted._implicit():
+        found = cp.simulate(loop, T, None, [1.0, 0.0], method="python").outputs
+    np.testing.assert_allclose(found, [np.cos(T), -np.sin(T)], rtol=0, atol=1e-6)
