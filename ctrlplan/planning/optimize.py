@@ -406,14 +406,21 @@ class _Segments:
 
     def rounding(self, found: _Solution) -> Array:
         """Estimate (naxes,) of the error of the cost."""
-        data = self._data(*found.sides)
-        errors = _rounding(self.root @ data, np.abs(self.root) @ np.abs(data)).sum(axis=1)
-        ofcost = errors @ self.durations ** (1 - 2 * self.derivative)
-        return np.asarray(ofcost + 16.0 * _EPS * np.abs(found.slope).sum(axis=1))  # of the times
+        data, weight = self._data(*found.sides), self.durations ** (1 - 2 * self.derivative)
+        value = self.root @ data
+        ofcost = _rounding(value, np.abs(self.root) @ np.abs(data)).sum(axis=1) @ weight
+        oftimes = 16.0 * _EPS * np.abs(found.slope).sum(axis=1)
+        # The cost by the distances of the positions, and so by each position.
+        pull = 2.0 * weight * (self.root[:, data.shape[1] // 2] @ value)
+        change = np.abs(np.diff(pull, axis=1, prepend=0.0, append=0.0))
+        ofpositions = _EPS * (change * np.abs(found.sides[0][:, 0])).sum(axis=1)
+        return np.asarray(ofcost + oftimes + ofpositions)
 
     def _data(self, left: Array, right: Array) -> Array:
         """Entries (naxes, nentries, nsegments) of both ends of each segment in relative time."""
-        return np.concatenate([right[:, :, :-1], left[:, :, 1:]], axis=1) * self.powers
+        ends = np.concatenate([right[:, :, :-1], left[:, :, 1:]], axis=1)
+        _shift(ends.transpose(2, 1, 0))
+        return ends * self.powers
 
     def _banded(self, group: _Group, estimate: bool) -> Array | None:
         """All entries in linear time; None where the free ones are not unique."""
@@ -435,7 +442,7 @@ class _Segments:
         table, free = np.nan_to_num(group.rows).transpose(2, 1, 0), ~group.known
         weight = self.durations ** (0.5 - self.derivative)
         equations = self.root * (self.powers * weight).T[:, None, :]
-        right = -equations @ np.concatenate([table[:-1], table[1:]], axis=1)
+        right = -equations @ self._known_ends(group)
         found = chain_least_squares(equations, right, free & ~group.loose, free & group.loose)
         if found is None:
             return None
@@ -459,8 +466,17 @@ class _Segments:
         np.put_along_axis(samples, ends[:, None, :], self.root * self.powers.T[:, None, :], axis=2)
         matrix = samples.reshape(-1, fixed.size)
         weight = np.repeat(self.durations ** (0.5 - self.derivative), len(self.root))
-        entries[~fixed], unique = _least_squares(matrix[:, ~fixed], -matrix @ entries, weight)
+        sides = -self.root @ (self.powers.T[:, :, None] * self._known_ends(group))
+        entries[~fixed], unique = _least_squares(matrix[:, ~fixed], sides.reshape(len(matrix), -1), weight)
         return entries[left].T, entries[right].T, unique
+
+    def _known_ends(self, group: _Group) -> Array:
+        """Prescribed entries (nsegments, nentries, naxes) of both ends of each segment, 0 for free ones."""
+        table = np.nan_to_num(group.rows).transpose(2, 1, 0)
+        ends = np.concatenate([table[:-1], table[1:]], axis=1)
+        position = group.known[:, 0]
+        _shift(ends, position[:-1] & position[1:])
+        return ends
 
 
 class _Whole:
@@ -521,6 +537,14 @@ def _segment_roots(alpha: float, order: int, derivative: int) -> tuple[Array, Ar
     system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
     root = np.linalg.qr(system.squared_samples(derivative) @ _fitted(system, np.eye(system.size))).R
     return readonly(root), readonly(root * np.array([*given, *given]))
+
+
+def _shift(ends: Array, where: NDArray[np.bool_] | bool = True) -> None:
+    """Shift segments, with entries (nsegments, nentries, naxes) of both ends, to start at 0.
+
+    Derivatives do not depend on the origin, and the difference of two near positions has all of their digits.
+    """
+    ends[:, [0, ends.shape[1] // 2]] -= (ends[:, 0] * np.reshape(where, (-1, 1)))[:, None]
 
 
 def _fitted(system: NewtonSystem, entries: Array) -> Array:

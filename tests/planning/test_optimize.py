@@ -741,13 +741,13 @@ def test_a_short_inner_segment_is_right_or_says_what_it_costs(gap, order):
         assert not word
         assert found.cost == pytest.approx(minimum_jerk(times, times), rel=1e-6)
         assert found.plan(times) == pytest.approx(times, rel=1e-15)
-    elif gap <= 1e-6:
+    elif gap <= 1e-9:
         assert "have 16 digits" in word
         assert "from waypoints[1] to [2]" in word
-    if gap >= 1e-4:
+    if gap >= 1e-5:
         assert not word
-    if not word:
-        assert found.cost == pytest.approx(minimum_jerk(times, times), rel=1e-6)
+    if found:  # rounding of one position changes the cost by 2e-16/gap, and there are two
+        assert found.cost == pytest.approx(minimum_jerk(times, times), rel=1e-6 if order == 2 else 1e-12 + 1e-15 / gap)
 
 
 @pytest.mark.parametrize("seed", range(6))
