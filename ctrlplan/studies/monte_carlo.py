@@ -183,8 +183,10 @@ def _checked_draws(draws: Mapping[str, ArrayLike]) -> dict[str, Array]:
     if not table or len(set(sizes.values())) != 1 or any(len(shape) != 1 or not shape[0] for shape in sizes.values()):
         raise ValueError(f"draws must have equally many values of each parameter, at least one, got shapes {sizes}")
     for name, values in table.items():
-        if not np.isfinite(values).all():
-            raise ValueError(f"draws must be finite, got {values[~np.isfinite(values)][0]} of {name!r}")
+        lacking = np.flatnonzero(~np.isfinite(values))
+        if lacking.size:
+            rest = f"; {lacking.size} of {values.size} draws have no value of it" if lacking.size > 1 else ""
+            raise ValueError(f"draws must be finite, got draws[{name!r}][{lacking[0]}] = {values[lacking[0]]}{rest}")
     return table
 
 
