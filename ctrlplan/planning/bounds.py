@@ -36,7 +36,8 @@ class Limits:
     low, high : float, sequence of float or callable, optional
         Minimum and maximum, in the unit of the signal; None or infinite for no
         limit. With `along`: values at its times. A function maps times [s]
-        (ntime,) of the given plan to values (ntime,).
+        (ntime,) of the given plan to values (ntime,); values within less than 1e-4
+        of the duration may be missed.
     rate : float or (float, float), optional
         Maximum magnitude of the time derivative, or its minimum and maximum, in
         the unit of the signal per second. For a held signal of a loop: its change

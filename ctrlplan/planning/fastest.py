@@ -92,7 +92,16 @@ _SLOWED = 1.002
 _NEARBY = 1e-7 * 4.0 ** np.arange(11)
 """Distances of factors from 1 at which an excess over a limit is evaluated."""
 
+_PLACES, _NARROW, _ZERO = 8, 1.01, 1e-10
+"""Maximum number of places at which limits over time require finer cells, the factor by which a law may be slowed
+without them, and a limit that is 0, relative to the largest one."""
+
+_ABOUT_NARROW = 4.0 ** -np.arange(2.0, 15.0)
+"""Distances of edges of these cells from such a place, relative to the duration."""
+
 _LOCAL = "not searched; a local minimum of the time law"
+
+_GIVEN = "not found: the time law is that of the given plan"
 
 Ends = Literal["free", "given"]
 """Speeds at the ends of a plan with another time law."""
@@ -453,6 +462,8 @@ def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, f
     if limited.order > HIGHEST:
         law = with_fast_time_law(uniform.plan.shift(-start), limited)
     retimed = uniform if law is None else fastest_within(law.shift(start), limited, span)
+    if retimed is uniform and limited.order <= HIGHEST:
+        return replace(uniform, hold="path", statement=_GIVEN)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold="path")
 
 
@@ -613,16 +624,49 @@ def _with_free_ends(
     plan: Trajectory, limited: Limited, span: tuple[float, float] | None
 ) -> tuple[Trajectory, Margins, tuple[float, ...]]:
     """Fastest plan on a path with any speeds at its ends, its margins, and the times of stops at its corners."""
-    law = _law_on_path(plan, limited)
+    law, slower = _law_under_narrow_limits(plan, limited)
     found = law.plan
-    slower = [required_rate(bound, law.plan, plan.start) for bound in limited.bounds if _is_over_time(bound)]
-    shortest = max(_closed_form(found, limited), found.duration * max(slower, default=0.0)) * _ABOVE
+    shortest = max(_closed_form(found, limited), found.duration * slower) * _ABOVE
     if span is not None and max(shortest, span[0]) > span[1]:
         raise ValueError(
             f"limits must be satisfied for some duration from {span[0]:.4g} to {span[1]:.4g} s, got a minimum of "
             f"{shortest:.6g} s"
         )
     return *_satisfying(limited, found.retime, shortest if span is None else max(shortest, span[0])), law.stops
+
+
+def _law_under_narrow_limits(plan: Trajectory, limited: Limited) -> tuple[FastLaw, float]:
+    """Fast time law and the factor by which it must be slower, with finer cells where limits over time require them."""
+    law, narrow = _law_on_path(plan, limited), list[float]()
+    bounds = [bound for bound in limited.bounds if _is_over_time(bound)]
+    while bounds:
+        worst = [(*required_rate(bound, law.plan, plan.start), bound) for bound in bounds]
+        slower, time, bound = max(worst, key=lambda own: own[0])
+        if slower <= _NARROW:
+            return law, slower
+        _check_passable(plan, bound, time)
+        about = time + plan.duration * np.concatenate([[0.0], _ABOUT_NARROW, -_ABOUT_NARROW])
+        narrow += about.tolist()
+        try:
+            law = _law_on_path(plan, limited, narrow=narrow)
+        except ValueError:  # cells too different for their linear equations
+            return law, slower
+        if len(narrow) >= _PLACES * about.size:
+            return law, max(required_rate(bound, law.plan, plan.start)[0] for bound in bounds)
+    return law, 0.0
+
+
+def _check_passable(plan: Trajectory, bound: Bound, time: float) -> None:
+    """Raise for a limit of a velocity that is 0 where the path moves, which no time law passes."""
+    low, high = bound.sides(np.append(np.linspace(plan.start, plan.end, 65), time))
+    limit = min(abs(float(high[-1])), abs(float(low[-1])))
+    if bound.order == 1 and limit <= _ZERO * max(
+        np.abs(side[np.isfinite(side)]).max(initial=0.0) for side in (low, high)
+    ):
+        raise ValueError(
+            f"limits of {bound.name} must not be 0 where the path moves, got from {low[-1]:.4g} to {high[-1]:.4g} at "
+            f"{time:.6g} s of the given plan; give a limit above 0 there, or stop the plan there"
+        )
 
 
 def _with_given_ends(
@@ -681,13 +725,17 @@ def _check_given_speeds(plan: Trajectory, limited: Limited) -> None:
                 )
 
 
-def _law_on_path(plan: Trajectory, limited: Limited, given: Rates = (None, None), reserve: float = 0.0) -> FastLaw:
+def _law_on_path(
+    plan: Trajectory,
+    limited: Limited,
+    given: Rates = (None, None),
+    reserve: float = 0.0,
+    narrow: Sequence[float] = (),
+) -> FastLaw:
     """Fast time law; positions in the path have full precision relative to its start."""
     begun = plan.shift(-plan.start) if plan.start else plan
-    if limited.order == 3:
-        found = fastest_smooth_law(begun, limited.bounds, plan.start, given, reserve)
-    else:
-        found = fastest_law(begun, limited.bounds, plan.start, given, reserve)
+    fast_law = fastest_smooth_law if limited.order == 3 else fastest_law
+    found = fast_law(begun, limited.bounds, plan.start, given, reserve, narrow)
     return replace(found, plan=found.plan.shift(plan.start)) if plan.start else found
 
 
@@ -991,6 +1039,9 @@ def _scanned(family: PlansByDuration, span: tuple[float, float] | None) -> tuple
 def _scan(family: PlansByDuration, low: float, high: float) -> tuple[Array, Array]:
     """Durations in an interval, increasing, and their excess."""
     grid = np.geomspace(low, high, max(9, math.ceil(family.per_octave * math.log2(high / low))))
+    if isinstance(family, ReplannedPlans) and low < family.given.duration < high:
+        # Far from it the given plan may be the only one that satisfies the limits.
+        grid = np.insert(grid, np.searchsorted(grid, family.given.duration), family.given.duration)
     return scan(family.excess, grid, 0.0, values=family.excesses(grid))
 
 

@@ -782,3 +782,12 @@ def test_the_smallest_velocities_at_the_ends_are_rest_on_the_path():
     """Without warnings of numpy: 1 m with 5 m/s^2 up to 2 m/s takes 1/2 + 2/5 s."""
     move = cp.PolySpline([cp.Waypoint(0, 0, 1e-160, 0), cp.Waypoint(1, 1, 1e-160, 0)])
     assert cp.fastest(move, {"y_d1": 2.0, "y_d2": 5.0}, hold="path").duration == pytest.approx(0.9, rel=0.005)
+
+
+@pytest.mark.parametrize("limit", [1e-6, 1e-9, 1e-15])
+def test_a_given_plan_that_alone_satisfies_the_limits_is_found(limit):
+    """A move at constant velocity 1, prescribed at both ends: no acceleration at its own duration only."""
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 1, 0), cp.Waypoint(1, 1, 1, 0)])
+    found = cp.fastest(plan, {"acceleration": limit}, hold="waypoints")
+    assert found.margins.satisfied
+    assert found.duration == pytest.approx(1.0, abs=limit)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from path_program import optimum
+from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan import PolySpline, TrigSpline, Waypoint, fastest
@@ -34,6 +35,28 @@ def test_a_crane_is_as_fast_as_by_a_nonlinear_program(plan, limits):
 
 
 @pytest.mark.slow
+def bang_bang(limit):
+    """Minimum duration of a move of 1 with y' + y''/2 = u and abs(u) <= limit: one change of sign at t_1."""
+    # The velocity is L (1 - exp(-2 t_1)) at t_1, and 0 after a further t_2; u has the integral L (t_1 - t_2) = 1.
+    t2 = brentq(lambda t2: math.log(2.0 - math.exp(-2.0 * (1.0 / limit + t2))) / 2.0 - t2, 0.0, 1.0, xtol=1e-15)
+    return 1.0 / limit + 2.0 * t2
+
+
+@pytest.mark.parametrize("limit", [1e-8, 1e-3, 1.0, 366.524, 1000.0, 7e3])
+def test_a_force_of_any_size_is_a_time_law_of_its_own(limit):
+    move = PolySpline([Waypoint(0, 0, 0, 0, 0, 0), Waypoint(2, 1, 0, 0, 0, 0)])
+    found = fastest(move, {"u": limit}, lambda jet: {"u": jet[1, 0] + 0.5 * jet[2, 0]}, hold="path")
+    assert found.margins.satisfied
+    assert bang_bang(limit) <= found.duration <= 1.01 * bang_bang(limit)
+
+
+@pytest.mark.parametrize("duration", [1e-9, 1e-4, 1e5, 1e12])
+def test_the_time_law_does_not_depend_on_the_duration_of_the_given_plan(duration):
+    move = PolySpline([Waypoint(0, 0, 0, 0, 0, 0), Waypoint(duration, 1, 0, 0, 0, 0)])
+    found = fastest(move, {"u": 1.0}, lambda jet: {"u": jet[1, 0] + 0.5 * jet[2, 0]}, hold="path")
+    assert bang_bang(1.0) <= found.duration <= 1.01 * bang_bang(1.0)
+
+
 def test_a_linear_quantity_is_a_limit_of_its_derivative():
     """A force of 3 times the acceleration: the trapezoid."""
     move = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 4, 0, 0)])

@@ -43,7 +43,12 @@ _ENDS = readonly(np.array([0.0, 1.0]))
 
 
 def fastest_smooth_law(
-    plan: Trajectory, bounds: Sequence[Bound], start: float, given: Rates = (None, None), reserve: float = 0.0
+    plan: Trajectory,
+    bounds: Sequence[Bound],
+    start: float,
+    given: Rates = (None, None),
+    reserve: float = 0.0,
+    narrow: Sequence[float] = (),
 ) -> FastLaw:
     """Time law of minimum duration under limits up to the jerk.
 
@@ -59,13 +64,15 @@ def fastest_smooth_law(
         Squared rates of the law at its ends; None for free ones.
     reserve : float, optional
         Distance from the limits, relative to them.
+    narrow : sequence of float, optional
+        Further times [s] of the given plan at which cells end, where limits over time are narrow.
 
     Raises
     ------
     ValueError
         If no law with given rates at its ends is found.
     """
-    edges = [time - start + plan.start for bound in bounds for time in changes(bound)]
+    edges = [time - start + plan.start for times in (*map(changes, bounds), narrow) for time in times]
     parts = parts_of(plan, True, edges, given, start)
     grid = Grid.of(plan, [part for part in parts if part.moves])
     problems = _Problems(grid, Activity.of(grid, bounds, SMOOTH_POINTS, start), reserve)

@@ -52,6 +52,7 @@ def fastest_law(
     start: float,
     given: Rates = (None, None),
     reserve: float = 0.0,
+    narrow: Sequence[float] = (),
 ) -> FastLaw:
     """Time law of minimum duration under limits of velocities and accelerations.
 
@@ -67,13 +68,15 @@ def fastest_law(
         Squared rates of the law at its ends; None for free ones.
     reserve : float, optional
         Distance from the limits, relative to them.
+    narrow : sequence of float, optional
+        Further times [s] of the given plan at which cells end, where limits over time are narrow.
 
     Raises
     ------
     ValueError
         If the rate is not limited, or velocities at the ends are infeasible.
     """
-    edges = [time - start + plan.start for bound in bounds for time in changes(bound)]
+    edges = [time - start + plan.start for times in (*map(changes, bounds), narrow) for time in times]
     parts = parts_of(plan, any(bound.order == 2 for bound in bounds), edges, given, start)
     grid = Grid.of(plan, [part for part in parts if part.moves])
     for refinement in range(_REFINEMENTS + 1):

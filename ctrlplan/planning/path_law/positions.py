@@ -39,15 +39,20 @@ def maximum_excess(bound: Bound, plan: Retimed, start: float) -> tuple[Array, Ar
     return _maxima(bound, plan, start, excess)
 
 
-def required_rate(bound: Bound, plan: Retimed, start: float) -> float:
-    """Factor by which a plan must be slower for a limit of a derivative to be satisfied."""
+def required_rate(bound: Bound, plan: Retimed, start: float) -> tuple[float, float]:
+    """Factor by which a plan must be slower for a limit of a derivative to be satisfied, and where it must be.
+
+    The place is a time [s] of the given plan.
+    """
 
     def share(values: Array, low: Array, high: Array) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.stack([values / high, values / low])
         return np.where(np.isfinite(shares), np.maximum(shares, 0.0), 0.0)
 
-    return float(_maxima(bound, plan, start, share)[0].max()) ** (1.0 / bound.order)
+    shares, times = _maxima(bound, plan, start, share)
+    worst = int(shares.argmax())
+    return float(shares[worst]) ** (1.0 / bound.order), start + float(plan.law(times[worst])) - plan.plan.start
 
 
 @dataclass(frozen=True)

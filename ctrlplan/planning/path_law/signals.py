@@ -86,8 +86,8 @@ _INFEASIBLE = 0.05
 _CHECKS: Array = np.linspace(0.0, 1.0, 25)
 """Points of a cell, in time, at which that is evaluated."""
 
-_SLOWEST = 1e-12
-"""Smallest multiple of a squared rate that is tried, and reciprocal of the largest one."""
+_SLOWEST, _SMALL = 1e-40, 1e-6
+"""Smallest multiple of a squared rate that is tried, and reciprocal of the largest one; those that are not small."""
 
 _PENALTY = 10.0
 """Penalty of a duration, relative to it, per violation relative to the scale of a limit."""
@@ -127,6 +127,10 @@ def fast_laws_of_signals(plan: Trajectory, limited: Limited, origin: float) -> I
     scale = problems.feasible_scale()
     if not 0.0 < scale < 1.0 / _SLOWEST:
         return
+    if not _SMALL < scale < 1.0 / _SMALL:  # as a plan whose rates are about 1
+        pace, scale = scale**0.5, 1.0
+        plan = plan.retime(plan.duration / pace)
+        problems = _Problems.of(plan, limited, origin / pace, (None, None))
     allowed = (0.0,) if problems.signed else _ALLOWED
     for law in problems.laws(_START * scale, _RESERVE, allowed):
         if law.duration < (1.0 - _RESERVE) * plan.duration / scale**0.5 or problems.signed:
@@ -226,18 +230,27 @@ class _Problems:
         return x
 
     def _tightened(self, x: Array, reserve: float, allowed: Sequence[float]) -> Iterator[PiecewisePolynomial]:
-        """Time laws near coefficients that satisfy the limits between the points as well, up to allowed violations."""
-        reserves = self._reserves(reserve)
+        """Time laws near coefficients that satisfy the limits between the points as well, up to allowed violations.
+
+        The last one, which is to be slowed, is that of the smallest violation, if tightening has failed.
+        """
+        reserves, nearest, least = self._reserves(reserve), None, math.inf
         for most in allowed:
             for _ in range(_TIGHTENINGS):
                 law = self._time_law(x)
                 excess = self._excess(law)
+                if excess.max() < least:
+                    nearest, least = law, float(excess.max())
                 if excess.max() <= most + _ROUNDING:
                     yield law
                     break
-                reserves += 1.5 * np.maximum(excess - min(most, 0.0), 0.0)
-                x, duration = self._converged(x, reserves)
+                duration = math.inf
+                if excess.min() < _INFEASIBLE:
+                    reserves += 1.5 * np.maximum(excess - min(most, 0.0), 0.0)
+                    x, duration = self._converged(x, reserves)
                 if not math.isfinite(duration):
+                    if nearest is not None and allowed[0] > 0.0 and least < _INFEASIBLE:
+                        yield nearest
                     return
 
     def _time_law(self, x: Array) -> PiecewisePolynomial:

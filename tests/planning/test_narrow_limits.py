@@ -1,0 +1,70 @@
+"""Limits of a velocity that change within a short part of the path."""
+
+import numpy as np
+import pytest
+
+import ctrlplan as cp
+
+MOVE = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+ACCELERATION = 5.0
+
+
+def optimum(limit, place):
+    """Minimum duration by v(x)^2 = min over z of limit(z)^2 + 2 a abs(x - z), on a grid that is fine about a place."""
+    near = np.geomspace(1e-12, 1.0, 40_000)
+    times = np.unique(np.clip(np.concatenate([place - near, place + near, np.linspace(0.0, 1.0, 20_001)]), 0.0, 1.0))
+    x = MOVE(times)
+    _, first = np.unique(x, return_index=True)
+    x, squares = x[first], np.minimum(limit(times[first]), 1.0) ** 2
+    squares[[0, -1]] = 0.0
+    shifted = 2.0 * ACCELERATION * x
+    squares = np.minimum(
+        shifted + np.minimum.accumulate(squares - shifted),
+        np.minimum.accumulate((squares + shifted)[::-1])[::-1] - shifted,
+    )
+    # 1/v of a v^2 that is linear between the points has the integral 2 h/(v_0 + v_1).
+    v = np.sqrt(np.maximum(squares, 0.0))
+    return float((2.0 * np.diff(x) / (v[1:] + v[:-1])).sum())
+
+
+def fastest(limit):
+    limits = {"y_d1": cp.Limits(low=-1.0, high=limit), "y_d2": ACCELERATION}
+    return cp.fastest(MOVE, limits, hold="path")
+
+
+@pytest.mark.parametrize(
+    ("limit", "place"),
+    [
+        (lambda t: 1.0 - 0.99 * np.exp(-(((t - 0.5) / 1e-4) ** 2)), 0.5),
+        (lambda t: 1.0 - 0.95 * np.exp(-(((t - 0.7123) / 3e-4) ** 2)), 0.7123),
+        (lambda t: 1.0 - 0.95 * np.exp(-(((t - 0.312) / 1e-4) ** 2)), 0.312),
+        (lambda t: 0.01 + np.sqrt(np.abs(t - 0.3)), 0.3),
+        (lambda t: 1e-6 + np.abs(t - 0.3), 0.3),
+    ],
+)
+def test_a_narrow_limit_slows_the_plan_there_only(limit, place):
+    found = fastest(limit)
+    assert found.margins.satisfied
+    assert optimum(limit, place) * (1.0 - 1e-5) <= found.duration <= 1.01 * optimum(limit, place)
+
+
+def test_two_narrow_limits():
+    def limit(t):
+        return 1.0 - 0.95 * np.exp(-(((t - 0.4) / 3e-4) ** 2)) - 0.9 * np.exp(-(((t - 0.7) / 2e-4) ** 2))
+
+    found = fastest(limit)
+    assert found.margins.satisfied
+    assert found.duration < 2.0
+
+
+@pytest.mark.parametrize(
+    ("limits", "time"),
+    [
+        ({"high": lambda t: 1.0 - np.exp(-(((t - 0.5) / 0.01) ** 2))}, "0.5"),
+        ({"high": lambda t: np.abs(t - 0.3)}, "0.3"),
+        ({"high": [1.0, 0.0, 1.0], "along": [0.0, 0.6, 1.0]}, "0.6"),
+    ],
+)
+def test_a_limit_of_0_is_never_passed(limits, time):
+    with pytest.raises(ValueError, match=rf"y_d1 must not be 0 where the path moves, .* at {time} s of the given plan"):
+        cp.fastest(MOVE, {"y_d1": cp.Limits(low=-1.0, **limits), "y_d2": ACCELERATION}, hold="path")
