@@ -41,8 +41,8 @@ def real_array(values: ArrayLike, name: str) -> Array:
     Raises
     ------
     TypeError
-        If the values are strings, complex, dates or time differences, or have
-        a physical unit, as the required unit is not known.
+        If the values are strings, truth values, complex, dates or time
+        differences, or have a physical unit, as the required unit is not known.
     ValueError
         If a value is masked or overflows, or rows differ in length.
     """
@@ -66,7 +66,9 @@ def real_array(values: ArrayLike, name: str) -> Array:
             raise ValueError(f"{name} must be within floating point, got {given!r:.80}") from None
         except (TypeError, ValueError):
             raise TypeError(f"{name} must be real numbers, got {given!r:.80}") from None
-    if array.dtype.kind not in "buif":
+    if array.dtype.kind == "b":
+        raise TypeError(f"{name} must be numbers, got truth values {given!r:.60}; apply a mask to the numbers first")
+    if array.dtype.kind not in "uif":
         kind = "complex numbers" if array.dtype.kind == "c" else f"{given!r:.80}"
         raise TypeError(f"{name} must be real numbers, got {kind}")
     return array.astype(float, copy=False)
@@ -135,8 +137,6 @@ def new_numbers(values: object, name: str) -> Array:
 def checked_timepts(t: ArrayLike, name: str = "times") -> Array:
     """Times as an array of any shape, without nan."""
     times = real_array(t, name)
-    if times is not t and np.asarray(t).dtype.kind == "b":
-        raise TypeError(f"{name} must be numbers, got truth values {t!r:.60}; apply a mask to the times first")
     # The minimum is nan if any time is nan; argmin is much faster than min for few times.
     if times.size and math.isnan(times.item(times.argmin())):
         raise ValueError(f"{name} must not be nan, got nan at index {int(np.isnan(times).argmax())}")

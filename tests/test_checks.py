@@ -118,3 +118,9 @@ def test_kinds():
         check_kind(3, "order", str)
     with pytest.raises(TypeError, match=r"^block must be a control system, got int$"):
         check_kind(3, "block", str, "a control system")
+
+
+@pytest.mark.parametrize("values", [[True, False], np.array([True]), True])
+def test_truth_values_are_no_numbers(values):
+    with pytest.raises(TypeError, match="values must be numbers, got truth values"):
+        _checks.real_array(values, "values")

@@ -59,9 +59,11 @@ class Checkpoint:
         ValueError
             If the folder has the checkpoint of another study.
         OSError
-            If the folder cannot be made or written to.
+            If it is a file, or the folder cannot be made or written to.
         """
         path = Path(folder)
+        if path.exists() and not path.is_dir():
+            raise FileExistsError(f"checkpoint must be a folder, got {path}, which is a file; give another path")
         path.mkdir(parents=True, exist_ok=True)
         known = path / _STUDY
         if known.exists():

@@ -86,10 +86,11 @@ def monte_carlo(
     loop : control system or callable
         A loop with the drawn parameters in the ``params`` of its blocks; it is
         prepared once for all draws. Or a function whose arguments have the
-        names of the draws: it is called with a value of each by keyword and
-        returns a loop; linear loops of the same structure are solved together in
-        closed form. Any other callable maps the name of a plan and the plan
-        to a loop, as in `compare`, with the parameters in its blocks.
+        names of the draws, or which takes any keyword: it is called with a value
+        of each by keyword and returns a loop; linear loops of the same structure
+        are solved together in closed form. Any other callable maps the name of a
+        plan and the plan to a loop, as in `compare`, with the parameters in its
+        blocks.
     draws : mapping of str to array_like, shape (ndraws,)
         Values of each parameter, as the function `draws` makes them.
     plans, timepts
@@ -207,7 +208,9 @@ def _is_of_draws(loop: object, table: dict[str, Array]) -> TypeGuard[Callable[..
     except (TypeError, ValueError):  # of some built-in functions
         return False
     named = set(signature.parameters)
-    if set(table) <= named and _binds(signature, **dict.fromkeys(table, 0.0)):
+    further = [one for name, one in signature.parameters.items() if name not in table]
+    takes_any = bool(further) and all(one.kind is inspect.Parameter.VAR_KEYWORD for one in further)  # **values
+    if (set(table) <= named or takes_any) and _binds(signature, **dict.fromkeys(table, 0.0)):
         return True
     if not _binds(signature, "", None) or set(list(signature.parameters)[:2]) & set(table):
         raise ValueError(

@@ -170,5 +170,5 @@ def test_a_checkpoint_is_a_path(folder):
 
 def test_a_file_is_no_folder(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(FileExistsError):
+    with pytest.raises(FileExistsError, match=r"checkpoint must be a folder, got .*file, which is a file; give"):
         swept(lag, tmp_path / "file")
