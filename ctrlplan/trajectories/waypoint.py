@@ -80,7 +80,8 @@ class Waypoint(Displayed, Fields):
         entries = [position, velocity, acceleration, jerk, snap]
         while len(entries) > 1 and entries[-1] is None:
             entries.pop()
-        self._set(checked_finite(time, "time"), _jet(entries), None)
+        rows = _rows(entries)
+        self._set(checked_finite(time, "time"), _jet(entries) if rows is None else rows, None)
 
     @classmethod
     def from_jets(cls, time: float, /, **jets: Sequence[float | None]) -> Waypoint:
@@ -361,6 +362,20 @@ def entry_name(order: int) -> str:
 
 def _prescribed(value: float) -> str:
     return "free" if value != value else number(value)
+
+
+def _rows(entries: list[ArrayLike | None]) -> Array | None:
+    """Table (order, axis) of arrays of floats of one shape; None for all other entries."""
+    first = entries[0]
+    if type(first) is not np.ndarray or first.ndim != 1 or not first.size:
+        return None
+    for entry in entries:
+        if type(entry) is not np.ndarray or entry.dtype != _DOUBLE or entry.shape != first.shape:
+            return None
+    return joined(cast("Sequence[Array]", entries)).reshape(len(entries), -1)
+
+
+_DOUBLE = np.dtype(float)
 
 
 def _jet(entries: list[ArrayLike | None]) -> Array:
