@@ -183,6 +183,8 @@ class PiecewiseSpline(WaypointSpline):
         (True, 1000)
         """
         entries = _entries_of(_checked_times(times), values, derivatives)
+        if labels is not None:
+            entries = entries.named(checked_labels(labels, entries.table.shape[2]))
         points = entries.waypoints() if isinstance(alpha, str) else ()
         plan = cls.__new__(cls)
         plan._fit(entries, chosen_alpha(alpha, points, cls, labels=labels), labels, warn)
@@ -316,7 +318,7 @@ class PiecewiseSpline(WaypointSpline):
             entries = _entries_of(self._entries.times, waypoints, derivatives)
             if entries.table.shape[2] != self.naxes:
                 raise ValueError(f"values must keep the number of axes, {self.naxes}, got {entries.table.shape[2]}")
-            plan = self._again(entries, self._warn, self)
+            plan = self._again(entries.named(self._entries.labels), self._warn, self)
         else:
             if derivatives is not None:
                 raise TypeError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
@@ -38,7 +38,8 @@ class Waypoint(Displayed, Fields):
     jet : ndarray, shape (nentries, naxes)
         The prescribed derivatives from order 0, nan if free.
     labels : tuple of str or None
-        Names of the axes; None unless made by `from_jets`.
+        Names of the axes; None unless made by `from_jets`, or by
+        `PiecewiseSpline.from_arrays` with names.
     naxes : int
         Number of axes.
     complete : bool
@@ -285,6 +286,14 @@ class Entries:
         """Entries from those by axis, (naxes, order + 1, nwaypoints), which are made read-only."""
         found = cls(times, readonly(rows).T, np.full(times.size, rows.shape[1]), None)
         found.__dict__["rows"] = rows  # the cached property needs no copy
+        return found
+
+    def named(self, labels: tuple[str, ...] | None) -> Entries:
+        """The same entries with other names of the axes."""
+        if labels == self.labels:
+            return self
+        found = replace(self, labels=labels)
+        found.__dict__["rows"] = self.rows
         return found
 
     @cached_property
