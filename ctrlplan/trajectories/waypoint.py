@@ -204,7 +204,9 @@ class Waypoint(Displayed, Fields):
 
     def to_dict(self) -> Data:
         """Plain data: time, and jet by order and axis (None if free)."""
-        jet = [[None if v != v else v for v in row] for row in self._shortest_jet.tolist()]
+        jet = [[None if v != v else v for v in row] for row in self.jet.tolist()]
+        while len(jet) > 1 and jet[-1].count(None) == self.naxes:  # as `_shortest_jet`
+            jet.pop()
         data: Data = {"time": self.time, "jet": jet}
         if self.labels is not None:
             data["labels"] = list(self.labels)
