@@ -365,8 +365,12 @@ class FreeEntries:
 
     def _plain(self, equations: _Banded, rows: Array) -> Array:
         with np.errstate(all="ignore"):
-            offset, data = self._shifted_data(rows)
-            jumps = self._jumps(data, self._terms, self.pattern.prescribed)
+            if self.pattern.ends_only:
+                found = equations.solve(self._inner_sides(rows))
+                found /= self._unknown_scale
+                return found
+            offset, shifted = self._shifted(rows)
+            jumps = self._jumps(self._data(shifted, self._scale), self._terms, self.pattern.prescribed)
             return self._restored(equations.solve(-jumps), self._unknown_scale, offset)
 
     def _refined(self, equations: _Banded, rows: Array, tolerance: float) -> NDArray[np.longdouble] | None:
@@ -432,22 +436,6 @@ class FreeEntries:
         shifted = rows.copy()
         shifted[:, 0] -= offset[:, None]
         return offset, shifted
-
-    def _shifted_data(self, rows: Array) -> tuple[Array, Array]:
-        """First prescribed position of each axis, and the data relative to it."""
-        pattern, scale = self.pattern, self._scale
-        lowest, ends = pattern.ends_only, slice(None, None, pattern.count - 1)
-        if not lowest:
-            offset, shifted = self._shifted(rows)
-            return offset, self._data(shifted, scale)
-        offset, data = rows[:, 0, 0].copy(), np.zeros(rows.shape)
-        np.multiply(rows[:, :lowest], scale[:lowest], out=data[:, :lowest])
-        np.subtract(rows[:, 0], offset[:, None], out=data[:, 0])
-        data[:, 0] *= scale[0]
-        data[:, lowest:, ends] = (
-            np.where(pattern.mask[lowest:, ends], rows[:, lowest:, ends], 0.0) * scale[lowest:, ends]
-        )
-        return offset, data
 
     def _data(self, rows: NDArray[Any], scale: NDArray[Any]) -> NDArray[Any]:
         """Prescribed entries in the units of the waypoints, 0 where free."""
@@ -517,6 +505,49 @@ class FreeEntries:
             jumps[:, :, 0] += jumps[:, :, -1]
         return np.asarray(jumps.reshape(naxes, -1).take(pattern.rows, axis=1))
 
+    def _inner_sides(self, rows: Array) -> Array:
+        """Right sides (naxes, nfree) if inner waypoints prescribe all orders below one, and none from it on."""
+        first, lower, ends = self._inner_weights
+        right = np.empty((len(rows), *first.shape[:0:-1]))  # by waypoint
+        by_order = right.transpose(2, 0, 1)
+        steps = rows[:, 0, 1:] - rows[:, 0, :-1]
+        np.multiply(first[0][:, None], steps[:, :-1], out=by_order)
+        by_order += first[1][:, None] * steps[:, 1:]
+        for order, around in enumerate(lower, 1):
+            for shift, own in enumerate(around):
+                by_order += own[:, None] * rows[:, order, shift : shift + first.shape[2]]
+        for side, orders, weights in ends:
+            right[:, -side] += rows[:, orders, -side].dot(weights)
+        return right.reshape(len(rows), -1)
+
+    @cached_property
+    def _inner_weights(self) -> tuple[Array, list[list[Array]], list[tuple[int, slice | list[int], Array]]]:
+        """Weights of the entries in the right sides of the inner waypoints, with the opposite sign of the jumps.
+
+        Those (2, norders, ninner) of the steps of the position before and after a waypoint;
+        for each further order that all waypoints prescribe those of the entries before, at
+        and after it; for the last and the first waypoint, the orders prescribed there alone
+        and their weights (norders, nfree).
+        """
+        pattern, scale = self.pattern, self._scale
+        every = np.zeros((2, pattern.free_orders.size, 2, pattern.size, self._durations.size))
+        for kind, terms in zip(pattern.kinds, self._terms, strict=True):
+            for n, (side, order) in enumerate(kind.entries):
+                nodes = slice(kind.first + side, kind.last + side)
+                every[:, :, side, order, kind.segments] = -terms[:, :, n] * scale[order, nodes]
+        after, before = every[0, ..., 1:], every[1, ..., :-1]  # of the segments at each inner waypoint
+        lower = [
+            [before[:, 0, k], before[:, 1, k] + after[:, 0, k], after[:, 1, k]] for k in range(1, pattern.ends_only)
+        ]
+        ends: list[tuple[int, slice | list[int], Array]] = []
+        for side, own in ((1, after[:, 1, :, -1]), (0, before[:, 0, :, 0])):
+            orders = [k for k in range(pattern.ends_only, pattern.size) if pattern.given[-side, k]]
+            if orders:
+                together = len(orders) == orders[-1] + 1 - orders[0]
+                where = slice(orders[0], orders[-1] + 1) if together else orders  # a slice is faster
+                ends.append((side, where, own[:, orders].T))
+        return np.array([before[:, 1, 0], after[:, 1, 0]]), lower, ends
+
     def _assembled(self, terms: list[NDArray[Any]]) -> _Banded | None:
         """Band matrix of the equations, factorised; None on overflow."""
         places = self.pattern.matrix
@@ -543,13 +574,13 @@ class _Banded:
         if not info:
             # Solutions for some right sides of size 1 bound the inverse from below, and nearly reach it.
             with np.errstate(all="ignore"):
-                largest = float(np.abs(self.solve(_signs(n))).max(initial=0.0))
+                largest = float(np.abs(self.solve(_signs(n).copy())).max(initial=0.0))
             self.condition = norm * largest if np.isfinite(largest) else np.inf
         self.loss = float(np.finfo(float).eps) * self.condition * amplification
 
     def solve(self, right: Array) -> Array:
-        """Solution (naxes, n)."""
-        found, _ = lapack.dgbtrs(self._lu, self._width, self._width, right.T, self._pivots)
+        """Solution (naxes, n); right sides in the order of rows are overwritten."""
+        found, _ = lapack.dgbtrs(self._lu, self._width, self._width, right.T, self._pivots, overwrite_b=True)
         return np.asarray(found.T)
 
 

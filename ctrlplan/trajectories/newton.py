@@ -248,16 +248,16 @@ class NewtonSystem(Fields):
 
     def coefficients_of_many(self, taylor_data: NDArray[Any]) -> Array:
         """The same for many columns, which are overwritten, by one product where that is as accurate."""
-        if self._inverse is None or taylor_data.dtype != np.float64:
+        if self.inverse is None or taylor_data.dtype != np.float64:
             return self.coefficients_of(taylor_data)
         offset, leading = taylor_data[self.pattern.anchor].copy(), self.pattern.leading
         taylor_data[slice(leading) if leading else self.order_index == 0] -= offset
-        found: Array = self._inverse @ taylor_data
+        found: Array = self.inverse @ taylor_data
         found[0] += offset
         return found
 
     @cached_property
-    def _inverse(self) -> Array | None:
+    def inverse(self) -> Array | None:
         """Matrix from Taylor data to coefficients; None where it loses digits."""
         if self._spread is not None or 0 not in self.pattern.keys or self.amplification > _PRODUCT:
             return None

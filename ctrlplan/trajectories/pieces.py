@@ -145,10 +145,13 @@ class Form:
         """Coefficients (size, naxes, nsegments) from entries (naxes, size, nwaypoints)."""
         system = self.system
         with np.errstate(over="ignore", invalid="ignore"):
-            data = self._taylor_data(rows)
             if self.is_careful:
-                found = self._carefully_solved(rows.astype(float, copy=False), data.astype(float, copy=False))
+                data = self._taylor_data(rows).astype(float, copy=False)
+                found = self._carefully_solved(rows.astype(float, copy=False), data)
+            elif self._in_turn and system.inverse is not None and rows.dtype == float:
+                found = self._multiplied(rows, system.inverse)
             else:
+                data = self._taylor_data(rows)
                 found = system.coefficients_of_many(data.reshape(len(data), -1))
                 found = np.ascontiguousarray(found).reshape(system.size, *data.shape[1:])
             if not math.isfinite(np.add.reduce(found, axis=None)) and not np.isfinite(found).all():
@@ -206,15 +209,25 @@ class Form:
         factors = self._factors if rows.dtype == float else self._factors_of(self._durations(rows.dtype))
         count = self.kind.last - first
         data = np.empty((system.order_index.size, len(rows), count), dtype=rows.dtype)
-        if self._in_turn:  # both ends of all orders together
-            by_order = data.reshape(-1, 2, len(rows), count)
-            for end in (0, 1):
-                own = rows[:, : len(by_order), first + end : first + end + count].swapaxes(0, 1)
-                np.multiply(own, factors[: len(by_order), None], out=by_order[:, end])
-            return data
         for row, waypoint, order in zip(data, system.waypoint_index.tolist(), system.order_index.tolist(), strict=True):
             np.multiply(rows[:, order, first + waypoint : first + waypoint + count], factors[order], out=row)
         return data
+
+    def _multiplied(self, rows: Array, inverse: Array) -> Array:
+        """Coefficients from entries in turn: the position at the start, and a product with all that differs from it."""
+        first, last = self.kind.first, self.kind.last
+        positions = rows[:, 0]
+        data = np.empty((len(inverse) - 1, len(rows), last - first))
+        np.subtract(positions[:, first + 1 : last + 1], positions[:, first:last], out=data[0])
+        by_order = data[1:].reshape(-1, 2, *data.shape[1:])
+        factors = self._factors[1 : 1 + len(by_order), None]
+        for end in (0, 1):
+            own = rows[:, 1 : 1 + len(by_order), first + end : last + end]
+            np.multiply(own.swapaxes(0, 1), factors, out=by_order[:, end])
+        found = np.empty((len(inverse), *data.shape[1:]))
+        found[0] = positions[:, first:last]
+        np.matmul(inverse[1:, 1:], data.reshape(len(data), -1), out=found[1:].reshape(len(data), -1))
+        return found
 
     @cached_property
     def _in_turn(self) -> bool:

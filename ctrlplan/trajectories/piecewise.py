@@ -183,6 +183,8 @@ class PiecewiseSpline(WaypointSpline):
         (True, 1000)
         """
         entries = _entries_of(_checked_times(times), values, derivatives)
+        if labels is not None:
+            entries = entries.named(checked_labels(labels, entries.table.shape[2]))
         points = entries.waypoints() if isinstance(alpha, str) else ()
         plan = cls.__new__(cls)
         plan._fit(entries, chosen_alpha(alpha, points, cls, labels=labels), labels, warn)
@@ -316,7 +318,7 @@ class PiecewiseSpline(WaypointSpline):
             entries = _entries_of(self._entries.times, waypoints, derivatives)
             if entries.table.shape[2] != self.naxes:
                 raise ValueError(f"values must keep the number of axes, {self.naxes}, got {entries.table.shape[2]}")
-            plan = self._again(entries, self._warn, self)
+            plan = self._again(entries.named(self._entries.labels), self._warn, self)
         else:
             if derivatives is not None:
                 raise TypeError(
@@ -414,15 +416,14 @@ class PiecewiseSpline(WaypointSpline):
                 weights = run.system.higher_ranges
                 if not weights.size:
                     continue
-                sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
-                bounds = (weights @ sizes).reshape(len(pieces.axes), -1)
-                highest = np.maximum.reduce(bounds, axis=1).tolist()
+                sizes = np.abs(run.coefficients[2:])
+                # The largest coefficients of all segments together bound nearly as much as those of each.
+                bounds = weights.dot(np.maximum.reduce(sizes, axis=2)).tolist()
                 for k, axis in enumerate(pieces.axes):
-                    allowed, own = _ROOM * spans[axis], positions[axis]
-                    if not highest[k] <= allowed:
-                        low, high = _range(run, k, np.flatnonzero(~(bounds[k] <= allowed)))
-                        if not (low >= own.min() - allowed and high <= own.max() + allowed):
-                            return False
+                    if not (
+                        bounds[k] <= _ROOM * spans[axis] or _is_near(run, k, weights.dot(sizes[:, k]), positions[axis])
+                    ):
+                        return False
         return True
 
     def _is_small(self, spans: list[float]) -> bool:
@@ -636,6 +637,21 @@ def _spans(positions: Array) -> list[float]:
     return [max(own) - min(own) if sum(own) < math.inf else math.nan for own in positions.tolist()]
 
 
+def _is_near(run: Run, axis: int, bounds: Array, positions: Array) -> bool:
+    """Whether one of the axes of a run stays near its positions.
+
+    The bounds (nsegments,) are those of what is added to the way from position to
+    position; where they do not suffice, the values decide.
+    """
+    low, high = float(positions.min()), float(positions.max())
+    allowed = _ROOM * (high - low)
+    wide = np.flatnonzero(~(bounds <= allowed))
+    if not wide.size:
+        return True
+    lowest, highest = _range(run, axis, wide)
+    return lowest >= low - allowed and highest <= high + allowed
+
+
 def _range(run: Run, axis: int, segments: slice | NDArray[np.intp]) -> tuple[float, float]:
     """Minimum and maximum of one of the axes in some segments of a run, on a grid."""
     values = run.system.functions.T @ run.coefficients[:, axis, segments]
@@ -669,7 +685,6 @@ def _entries_of(times: Array, values: ArrayLike, derivatives: Mapping[int, Array
     highest = max(orders, default=0)
     rows = np.empty((len(by_axis), 1 + highest, times.size))
     rows[:, 0] = by_axis
-    finite = are_finite(by_axis) or not np.isinf(by_axis).any()
     if len(orders) < highest:
         rows[:, 1:] = np.nan
     for order, given in orders.items():
@@ -680,8 +695,7 @@ def _entries_of(times: Array, values: ArrayLike, derivatives: Mapping[int, Array
                 f"got {row.shape}"
             )
         rows[:, order] = row
-        finite = finite and (are_finite(row) or not np.isinf(row).any())
-    if not finite:
+    if np.count_nonzero(np.isinf(rows)):
         i, order, axis = np.argwhere(np.isinf(rows.T))[0].tolist()
         name = f"derivatives[{order}]" if order else "values"
         raise ValueError(f"{name} must be finite or nan (free), got {rows[axis, order, i]} at times[{i}], axis {axis}")

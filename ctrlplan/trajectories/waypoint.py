@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
@@ -38,7 +38,8 @@ class Waypoint(Displayed, Fields):
     jet : ndarray, shape (nentries, naxes)
         The prescribed derivatives from order 0, nan if free.
     labels : tuple of str or None
-        Names of the axes; None unless made by `from_jets`.
+        Names of the axes; None unless made by `from_jets`, or by
+        `PiecewiseSpline.from_arrays` with names.
     naxes : int
         Number of axes.
     complete : bool
@@ -80,7 +81,8 @@ class Waypoint(Displayed, Fields):
         entries = [position, velocity, acceleration, jerk, snap]
         while len(entries) > 1 and entries[-1] is None:
             entries.pop()
-        self._set(checked_finite(time, "time"), _jet(entries), None)
+        rows = _rows(entries)
+        self._set(checked_finite(time, "time"), _jet(entries) if rows is None else rows, None)
 
     @classmethod
     def from_jets(cls, time: float, /, **jets: Sequence[float | None]) -> Waypoint:
@@ -202,7 +204,9 @@ class Waypoint(Displayed, Fields):
 
     def to_dict(self) -> Data:
         """Plain data: time, and jet by order and axis (None if free)."""
-        jet = [[None if v != v else v for v in row] for row in self._shortest_jet.tolist()]
+        jet = [[None if v != v else v for v in row] for row in self.jet.tolist()]
+        while len(jet) > 1 and jet[-1].count(None) == self.naxes:  # as `_shortest_jet`
+            jet.pop()
         data: Data = {"time": self.time, "jet": jet}
         if self.labels is not None:
             data["labels"] = list(self.labels)
@@ -286,6 +290,14 @@ class Entries:
         found.__dict__["rows"] = rows  # the cached property needs no copy
         return found
 
+    def named(self, labels: tuple[str, ...] | None) -> Entries:
+        """The same entries with other names of the axes."""
+        if labels == self.labels:
+            return self
+        found = replace(self, labels=labels)
+        found.__dict__["rows"] = self.rows
+        return found
+
     @cached_property
     def rows(self) -> Array:
         """The entries by axis, (naxes, order + 1, nwaypoints), as used in computations."""
@@ -361,6 +373,20 @@ def entry_name(order: int) -> str:
 
 def _prescribed(value: float) -> str:
     return "free" if value != value else number(value)
+
+
+def _rows(entries: list[ArrayLike | None]) -> Array | None:
+    """Table (order, axis) of arrays of floats of one shape; None for all other entries."""
+    first = entries[0]
+    if type(first) is not np.ndarray or first.ndim != 1 or not first.size:
+        return None
+    for entry in entries:
+        if type(entry) is not np.ndarray or entry.dtype != _DOUBLE or entry.shape != first.shape:
+            return None
+    return joined(cast("Sequence[Array]", entries)).reshape(len(entries), -1)
+
+
+_DOUBLE = np.dtype(float)
 
 
 def _jet(entries: list[ArrayLike | None]) -> Array:

@@ -224,25 +224,31 @@ def test_one_time_next_to_horner(benchmark, capsys, kind, naxes):
         print(f"\none time, {kind}, {naxes} axes: " + "; ".join(cells))
 
 
+SWINGS = [(kind, count, False) for kind in KINDS for count in (2, 4)]
+SWINGS += [("piecewise", count, False) for count in (10, 50, 1000)] + [("piecewise", 2, True)]
+
+
 @pytest.mark.benchmark(group="construct")
-@pytest.mark.parametrize(
-    ("kind", "count"),
-    [(kind, count) for kind in KINDS for count in (2, 4)] + [("piecewise", count) for count in (10, 50, 1000)],
-)
-def test_check_of_the_swing_next_to_construction(benchmark, capsys, kind, count):
-    """Samples of a sine with two derivatives, which no plan leaves far. Goal: at most 5 %."""
+@pytest.mark.parametrize(("kind", "count", "at_peak"), SWINGS)
+def test_check_of_the_swing_next_to_construction(benchmark, capsys, kind, count, at_peak):
+    """Samples of a sine with two derivatives. Goal: at most 5 % where bounds decide.
+
+    They do not where both of two waypoints are near a peak, so that the plan goes far beyond their positions: there
+    the values decide.
+    """
     make = {
         "trigonometric": lambda given, warn: TrigSpline(given, alpha=ALPHA, warn=warn),
         "polynomial": lambda given, warn: PolySpline(given, warn=warn),
         "piecewise": lambda given, warn: PiecewiseSpline(given, warn=warn),
     }[kind]
     seconds = []
-    for k in range(300 if count < 1000 else 40):
+    phases = [0.0, 2.0] if at_peak or count > 2 else [-1.0, 2.0]  # of both axes
+    for k in range(600 if count < 1000 else 40):
         row = {}
         for warn in (False, True) if k % 2 else (True, False):
             times = np.cumsum(RNG.uniform(0.7, 1.3, count))  # others each time: systems of equal times are shared
             given = [
-                Waypoint(t, *np.sin([[t + 0.5 * np.pi * nu, t + 2.0 + 0.5 * np.pi * nu] for nu in range(3)]))
+                Waypoint(t, *np.sin([[t + phase + 0.5 * np.pi * nu for phase in phases] for nu in range(3)]))
                 for t in times.tolist()
             ]
             begin = process_time()
@@ -253,8 +259,8 @@ def test_check_of_the_swing_next_to_construction(benchmark, capsys, kind, count)
     benchmark.extra_info["ratio"] = checked / quiet
     benchmark.pedantic(lambda: make(given, True), rounds=20)
     with capsys.disabled():
-        own, more = 1e6 * quiet, 1e6 * (checked - quiet)
-        print(f"\nswing, {kind}, {count} waypoints: {own:.0f} us, the check {more:+.1f} us, {more / own:+.1%}")
+        own, more, where = 1e6 * quiet, 1e6 * (checked - quiet), " near a peak" if at_peak else ""
+        print(f"\nswing, {kind}, {count} waypoints{where}: {own:.0f} us, the check {more:+.1f} us, {more / own:+.1%}")
 
 
 @pytest.mark.benchmark(group="sample")

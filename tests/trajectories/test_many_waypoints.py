@@ -373,6 +373,21 @@ def test_plans_from_arrays_and_waypoints_are_equal(tmp_path):
     assert plan != PiecewiseSpline([*points[:-1], Waypoint(times[-1], values[:, -1], 0.0)])
 
 
+def test_names_given_with_arrays_are_those_of_the_waypoints():
+    points = [Waypoint.from_jets(float(k), x=[k, 0.0], z=[1.0, 0.0]) for k in range(3)]
+    named = PiecewiseSpline(points)
+    positions = np.array([[0.0, 1.0, 2.0], [1.0, 1.0, 1.0]])
+    plan = PiecewiseSpline.from_arrays([0.0, 1.0, 2.0], positions, derivatives={1: 0.0}, labels=["x", "z"])
+    for one in (plan, plan.with_values(positions, derivatives={1: 0.0}), named.with_values(points)):
+        assert one == named
+        assert one.labels == ("x", "z")
+        assert one.waypoints == named.waypoints == tuple(points)
+    assert named.with_values(positions, derivatives={1: 0.0}).waypoints == tuple(points)
+    assert plan.retime(5.0).waypoints[0].labels == ("x", "z")
+    with pytest.raises(ValueError, match="values must keep the number of axes, 2, got 1"):
+        plan.with_values(np.zeros(3))
+
+
 def test_times_without_a_finite_duration_are_rejected():
     """Each segment has one, but `duration`, `retime` and a grid of times require that of the plan."""
     with pytest.raises(ValueError, match=r"duration must be finite and above 0, got 1e.308 s after -1e.308 s"):

@@ -100,11 +100,20 @@ INNER = {
 }
 
 
+ENDS = {
+    "all": ([0.0, 1.0, 0.5], [3.0, 0.0, 0.0]),
+    "acceleration free at the start": ([0.0, 1.0], [3.0, 0.7, 0.2]),
+    "velocity free at the end": ([0.0, 1.0, 0.5], [3.0, None, -0.4]),
+    "position alone at the end": ([0.0, 1.0, 0.5], [3.0]),
+}
+
+
 @pytest.mark.parametrize("alpha", [0.0, 1.0, 3.0, 5.0])
 @pytest.mark.parametrize("inner", INNER)
-def test_free_entries_are_continuous_and_so_are_their_conjugates(inner, alpha):
+@pytest.mark.parametrize("ends", ENDS)
+def test_free_entries_are_continuous_and_so_are_their_conjugates(ends, inner, alpha):
     """K = 3: entry j is free where derivative 5 - j does not jump."""
-    jets = [[0.0, 1.0, 0.5], *INNER[inner], [3.0, 0.0, 0.0]]
+    jets = [ENDS[ends][0], *INNER[inner], ENDS[ends][1]]
     plan = PiecewiseSpline(waypoints([0.0, 1.0, 1.5, 3.0], jets), alpha=alpha)
     assert miss(plan) <= 1e-12
     size = np.abs(plan.jet(np.linspace(0, 3, 101), 5)).max(axis=2)[:, 0]
