@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import control as ct
 import numpy as np
@@ -142,15 +143,17 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
     Jumps after the move are known before the sweep; it finds the others.
     """
 
+    built = lru_cache(maxsize=None)(_loop)
+
     def swept(gains: Array) -> Sweep:
-        found = sweep(_loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", measures=SWEPT)
+        found = sweep(built, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", measures=SWEPT)
         if found.interrupted:  # an incomplete sweep is not a result
             raise KeyboardInterrupt
         return found
 
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
     gains = np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 4)), list(NUMBERED["step"]))
-    found = swept(np.union1d(gains, _beside_jumps(gains, finest)))
+    found = swept(np.union1d(gains, _beside_jumps(gains, [built(gain) for gain in gains.tolist()], finest)))
     while True:
         settling = [rows["settling_time"] for rows in found.metrics.values()]
         jump, steep = (np.any([settling_jumps(found.values, r, s) for r in settling], axis=0) for s in (3.0, 1.5))
@@ -173,15 +176,14 @@ def _divided(gains: Array, parts: NDArray[np.intp]) -> Array:
     return np.append(gains[left] * (gains[left + 1] / gains[left]) ** part, gains[-1])
 
 
-def _beside_jumps(gains: Array, finest: float) -> Array:
-    """Gains on both sides of the jumps of settling times after the move, on a subdivision of given gains.
+def _beside_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -> Array:
+    """Gains on both sides of the jumps of settling times after the move, on a subdivision of given gains and loops.
 
     They enclose a jump to `finest`. One more gain is 16 times as far on the side
     where the extremum is outside of the band: there the curve begins like a square root.
     """
     parts = _parts(gains, finest)
     fine, ends = _divided(gains, parts), np.cumsum(parts)
-    loops = [_loop(gain) for gain in gains]
     beside = []
     for plan in linear_plans().values():
         after = CubicSpline(np.sqrt(gains), _after_move(loops, plan))(np.sqrt(fine))  # analytic functions of the gain
