@@ -49,7 +49,7 @@ def linear_plans() -> dict[str, Trajectory]:
     }
 
 
-def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) -> Study:
+def linear_study(progress: bool = True, count: int = 121, finest: float = 1e-3) -> Study:
     """Figure 1 and the figures of section 2.
 
     Parameters
@@ -58,7 +58,7 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
         Show a bar on stderr.
     count : int, optional
         Gains before refinement: as many evenly spaced in their square root, the
-        frequency of the loop, and a quarter as many in their logarithm.
+        frequency of the loop, and half as many in their logarithm.
     finest : float, optional
         Relative spacing of gains to which jumps of a settling time are located.
 
@@ -142,7 +142,6 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
 
     Jumps after the move are known before the sweep; it finds the others.
     """
-
     built = lru_cache(maxsize=None)(_loop)
 
     def swept(gains: Array) -> Sweep:
@@ -152,7 +151,7 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
         return found
 
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
-    gains = np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 4)), list(NUMBERED["step"]))
+    gains = np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 2)), list(NUMBERED["step"]))
     found = swept(np.union1d(gains, _beside_jumps(gains, [built(gain) for gain in gains.tolist()], finest)))
     while True:
         settling = [rows["settling_time"] for rows in found.metrics.values()]
@@ -179,7 +178,7 @@ def _divided(gains: Array, parts: NDArray[np.intp]) -> Array:
 def _beside_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -> Array:
     """Gains on both sides of the jumps of settling times after the move, on a subdivision of given gains and loops.
 
-    They enclose a jump to `finest`. One more gain is 16 times as far on the side
+    They enclose a jump to `finest`. One more gain is up to 16 times as far on the side
     where the extremum is outside of the band: there the curve begins like a square root.
     """
     parts = _parts(gains, finest)
@@ -190,8 +189,8 @@ def _beside_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -
         change = np.diff(np.floor(_last_extremum_outside(*after.T)))
         jump = np.flatnonzero(np.abs(change) > 0.0)
         where = np.searchsorted(ends, jump, side="right")
-        width = np.minimum(16, parts[where])
-        far = jump - (jump - ends[where]) % width + np.where(change[jump] > 0.0, width, 0)
+        first, last = ends[where] - parts[where], ends[where]
+        far = np.clip(np.where(change[jump] > 0.0, jump + 16, jump - 15), first, last)
         beside += [fine[jump], fine[jump + 1], fine[far]]
     return np.concatenate(beside)
 
