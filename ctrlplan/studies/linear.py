@@ -157,7 +157,7 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
         settling = [rows["settling_time"] for rows in found.metrics.values()]
         jump, steep = (np.any([settling_jumps(found.values, r, s) for r in settling], axis=0) for s in (3.0, 1.5))
         widest = np.select([jump, steep], [finest, max(finest, 0.02)], np.inf)
-        parts = np.minimum(_parts(found.values, widest), 4)
+        parts = np.minimum(_parts(found.values, widest), 8)
         if parts.max() == 1:
             return found
         found = found.merged(swept(np.setdiff1d(_divided(found.values, parts), found.values)))
