@@ -178,7 +178,7 @@ def _divided(gains: Array, parts: NDArray[np.intp]) -> Array:
 def _beside_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -> Array:
     """Gains on both sides of the jumps of settling times after the move, on a subdivision of given gains and loops.
 
-    They enclose a jump to `finest`. One more gain is up to 16 times as far on the side
+    They enclose a jump to `finest`. One more gain is up to 24 times as far on the side
     where the extremum is outside of the band: there the curve begins like a square root.
     """
     parts = _parts(gains, finest)
@@ -190,7 +190,7 @@ def _beside_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -
         jump = np.flatnonzero(np.abs(change) > 0.0)
         where = np.searchsorted(ends, jump, side="right")
         first, last = ends[where] - parts[where], ends[where]
-        far = np.clip(np.where(change[jump] > 0.0, jump + 16, jump - 15), first, last)
+        far = np.clip(np.where(change[jump] > 0.0, jump + 24, jump - 23), first, last)
         beside += [fine[jump], fine[jump + 1], fine[far]]
     return np.concatenate(beside)
 
