@@ -19,7 +19,7 @@ _SAMPLES = 2**19
 """Maximum number of samples of a signal over all loops that are solved together."""
 
 FIRST = 4
-"""Number of loops solved together at first; doubled each time, so that an interruption discards few results."""
+"""Number of loops solved together at first; fourfold each time, so that an interruption discards few results."""
 
 FIRST_OF_TASK = 32
 """The same in a task of an executor, which an interruption does not end."""
@@ -74,7 +74,7 @@ class Batches(Generic[T, R]):
             for (k, (linear, loop)), outcome in zip(waiting.items(), found, strict=True):
                 yield k, alone(k, linear, loop) if outcome is None else outcome
             waiting.clear()
-            size = min(2 * size, largest)
+            size = min(4 * size, largest)
 
         try:
             for k, value in enumerate(values):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
+from ctrlplan.simulation.exact import exact_states
 from ctrlplan.studies.benefit import benefit
 from ctrlplan.studies.comparison import Comparison, compare
 from ctrlplan.studies.running import Builder
@@ -46,7 +49,7 @@ def linear_plans() -> dict[str, Trajectory]:
     }
 
 
-def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) -> Study:
+def linear_study(progress: bool = True, count: int = 121, finest: float = 1e-3) -> Study:
     """Figure 1 and the figures of section 2.
 
     Parameters
@@ -55,7 +58,7 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
         Show a bar on stderr.
     count : int, optional
         Gains before refinement: as many evenly spaced in their square root, the
-        frequency of the loop, and a quarter as many in their logarithm.
+        frequency of the loop, and half as many in their logarithm.
     finest : float, optional
         Relative spacing of gains to which jumps of a settling time are located.
 
@@ -135,24 +138,87 @@ def _loop(gain: float) -> ct.StateSpace:
 
 
 def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
-    """Sweep over the gain, refined between gains where a settling time jumps."""
+    """Sweep over the gain, refined between gains where a settling time jumps, or changes steeply.
+
+    Jumps after the move are known before the sweep; it finds the others.
+    """
+    built = lru_cache(maxsize=None)(_loop)
 
     def swept(gains: Array) -> Sweep:
-        found = sweep(_loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", measures=SWEPT)
+        found = sweep(built, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", measures=SWEPT)
         if found.interrupted:  # an incomplete sweep is not a result
             raise KeyboardInterrupt
         return found
 
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
-    found = swept(np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 4)), list(NUMBERED["step"])))
+    gains = np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 2)), list(NUMBERED["step"]))
+    found = swept(np.union1d(gains, _beside_jumps(gains, [built(gain) for gain in gains.tolist()], finest)))
     while True:
-        jump = np.any([settling_jumps(found.values, r["settling_time"], 0.8) for r in found.metrics.values()], axis=0)
-        wide = found.values[1:] / found.values[:-1] > 1.0 + finest
-        left = found.values[:-1][jump & wide]
-        right = found.values[1:][jump & wide]
-        if not left.size:
+        settling = [rows["settling_time"] for rows in found.metrics.values()]
+        jump, steep = (np.any([settling_jumps(found.values, r, s) for r in settling], axis=0) for s in (3.0, 1.5))
+        widest = np.select([jump, steep], [finest, max(finest, 0.02)], np.inf)
+        parts = np.minimum(_parts(found.values, widest), 8)
+        if parts.max() == 1:
             return found
-        found = found.merged(swept(np.sqrt(left * right)))
+        found = found.merged(swept(np.setdiff1d(_divided(found.values, parts), found.values)))
+
+
+def _parts(gains: Array, widest: ArrayLike) -> NDArray[np.intp]:
+    """Numbers of parts, powers of two, of intervals of gains so that none is wider, relative to the gain."""
+    return 2 ** np.ceil(np.log2(np.maximum(np.log(gains[1:] / gains[:-1]) / np.log1p(widest), 1.0))).astype(np.intp)
+
+
+def _divided(gains: Array, parts: NDArray[np.intp]) -> Array:
+    """Gains with the intervals between them divided into parts, evenly in the logarithm."""
+    left = np.repeat(np.arange(parts.size), parts)
+    part = (np.arange(left.size) - (np.cumsum(parts) - parts)[left]) / parts[left]
+    return np.append(gains[left] * (gains[left + 1] / gains[left]) ** part, gains[-1])
+
+
+def _beside_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -> Array:
+    """Gains on both sides of the jumps of settling times after the move, on a subdivision of given gains and loops.
+
+    They enclose a jump to `finest`. One more gain is up to 24 times as far on the side
+    where the extremum is outside of the band: there the curve begins like a square root.
+    """
+    parts = _parts(gains, finest)
+    fine, ends = _divided(gains, parts), np.cumsum(parts)
+    beside = []
+    for plan in linear_plans().values():
+        after = CubicSpline(np.sqrt(gains), _after_move(loops, plan))(np.sqrt(fine))  # analytic functions of the gain
+        change = np.diff(np.floor(_last_extremum_outside(*after.T)))
+        jump = np.flatnonzero(np.abs(change) > 0.0)
+        where = np.searchsorted(ends, jump, side="right")
+        first, last = ends[where] - parts[where], ends[where]
+        far = np.clip(np.where(change[jump] > 0.0, jump + 24, jump - 23), first, last)
+        beside += [fine[jump], fine[jump + 1], fine[far]]
+    return np.concatenate(beside)
+
+
+def _after_move(loops: Sequence[ct.StateSpace], plan: Trajectory) -> Array:
+    """Error and its derivative at the end of the move; sum and product of the poles, shape (nloops, 4)."""
+    a, b, c = (np.array([getattr(loop, name) for loop in loops]) for name in "ABC")
+    rest = np.linalg.solve(a, -b)[..., 0]
+    times = np.linspace(WAYPOINTS[0].time, WAYPOINTS[-1].time, 65)
+    states = exact_states(a, b, plan.segment_jet_at, list(plan.breakpoints), times, 0.0 * rest)
+    error = (states[..., -1] - rest)[..., None]
+    rows = [c[:, :1] @ error, c[:, :1] @ a @ error]
+    return np.column_stack([row.ravel() for row in rows] + [np.trace(a, axis1=1, axis2=2), np.linalg.det(a)])
+
+
+def _last_extremum_outside(error: Array, slope: Array, total: Array, product: Array) -> Array:
+    """Number of the last extremum outside of the settling band after the move, for increasing gains.
+
+    Continued to real numbers: the settling time jumps where it passes an integer.
+    nan if all extrema are inside. Arguments as by `_after_move`.
+    """
+    # The error is Re(size exp(pole t)), with extrema where Re(pole size exp(pole t)) = 0.
+    pole = 0.5 * total + 1j * np.sqrt(np.maximum(product - 0.25 * total**2, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):  # at the double pole
+        size = error - 1j * (slope - pole.real * error) / pole.imag
+        time = np.log(0.02 * np.abs(pole) / (np.abs(size) * pole.imag)) / pole.real
+        number = (np.unwrap(np.nan_to_num(np.angle(pole * size))) + pole.imag * time) / np.pi - 0.5
+    return np.where(time > 0.0, number, np.nan)
 
 
 def _notes(comparison: Comparison, swept: Sweep) -> list[str]:

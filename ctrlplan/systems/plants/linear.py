@@ -105,7 +105,8 @@ def _interconnected(
     wired = _wired(num, den, outputs)
     error, controller, plant = (ct.StateSpace(block, name=block.name) for block in wired.syslist)
     controller.D[0, 0] = gain
-    loop = ct.LinearICSystem(wired, ct.StateSpace(*_closed(plant, gain, outputs), 0), wired.connection_type)
+    loop = ct.LinearICSystem(wired, wired, wired.connection_type)
+    loop.A, loop.B, loop.C, loop.D = _closed(plant, gain, outputs)
     loop.syslist = [error, controller, plant]
     for name in ("connect_map", "input_map", "output_map"):
         setattr(loop, name, getattr(wired, name).copy())
