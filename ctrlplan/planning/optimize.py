@@ -284,10 +284,13 @@ def _check_digits(problem: _Problem, error: float, times: Array) -> None:
     size = np.nanmax(np.abs(problem.table[:, 0]), axis=0, initial=0.0)
     steps = np.diff(times)
     k = int(steps.argmin())
+    several = problem.family is _Segments
+    way = "merge waypoints, or use an origin nearer to the positions"
     why = (
-        f"an estimated relative error of {error:.1g}: positions up to {size.max():.3g} have 16 digits, and "
+        f"an estimated relative error of {error:.1g}: positions up to {size.max():.3g} have 16 digits, "
+        f"{'' if several else f'one spline has all {len(times)} waypoints, '}and "
         f"the time from waypoints[{k}] to [{k + 1}] is {steps[k] / steps.mean():.2g} of the mean segment; "
-        f"merge waypoints, or use an origin nearer to the positions"
+        f"{way if several else f'use one spline for each segment (single=False), {way}'}"
     )
     if error > _NONE:
         raise ValueError(f"the cost must be resolved in double precision, got {why}")

@@ -810,6 +810,14 @@ def test_a_single_spline_through_near_points_is_inaccurate_as_well():
         optimize_waypoints(points, single=True)
 
 
+def test_one_spline_through_many_points_names_that_reason():
+    points = [Waypoint(0, 0, 0, 0), *(Waypoint(t, math.sin(t)) for t in range(1, 30)), Waypoint(30, 0, 0, 0)]
+    said = r"one spline has all 31 waypoints, .*; use one spline for each segment \(single=False\), merge waypoints"
+    with pytest.raises(ValueError, match=said):
+        optimize_waypoints(points, single=True)
+    assert optimize_waypoints(points).unique
+
+
 def clamped(n, derivative, seed=0):
     """Times, positions of three axes, waypoints at rest at both ends, and scipy's spline of the same problem."""
     rng = np.random.default_rng(seed)
