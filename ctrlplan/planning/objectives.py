@@ -73,7 +73,7 @@ def plan_length(plan: Trajectory) -> float:
     Returns
     -------
     float
-        In the unit of the axes, with a relative error of 1e-9, also if a path of
+        In the unit of the axes, with a relative error of 1e-8, also if a path of
         several axes nearly stops; 0 for a step.
 
     See Also

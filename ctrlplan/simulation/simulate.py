@@ -188,7 +188,7 @@ def simulate_with_later_events(
     job = checked_job(system, timepts, inputs, initial_state, params=params, events=events)
     warn_of_unread(job.prepared, job.params)
     warn_of_timebase(job.prepared)
-    return _response_and_end(job, methods.METHODS, later=not any(callable(event.signal) for event in events or ()))
+    return _response_and_end(job, methods.METHODS, later=True)
 
 
 def checked_job(
@@ -226,9 +226,7 @@ def response_to(job: Job, chosen: Sequence[Method]) -> SimulationResponse:
     return _response_and_end(job, chosen, later=False)[0]
 
 
-def _response_and_end(
-    job: Job, chosen: Sequence[Method], later: bool
-) -> tuple[SimulationResponse, Occurrence | None]:
+def _response_and_end(job: Job, chosen: Sequence[Method], later: bool) -> tuple[SimulationResponse, Occurrence | None]:
     """Response by the first method that applies, and the event that ends it; others are located later, if possible."""
     fresh = fresh_job(job)
     try:
@@ -285,6 +283,7 @@ def _response(job: Job, record: Record, later: bool) -> tuple[SimulationResponse
     def outputs() -> Array:
         return seen.y.reshape(len(prepared.output_labels), times.size)
 
+    later = later and record.is_pure and not any(callable(event.signal) for event in job.events or ())
     response = SimulationResponse(
         times,
         outputs if record.is_pure else outputs(),
@@ -300,7 +299,7 @@ def _response(job: Job, record: Record, later: bool) -> tuple[SimulationResponse
         plot_inputs=bool(len(seen.u)),
         method=record.method,
         reason=record.reason,
-        events=found.located if later and record.is_pure else found.located(),
+        events=found.located if later else found.located(),
     )
     return response, stop
 

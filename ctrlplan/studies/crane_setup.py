@@ -126,9 +126,7 @@ def _tracking(plan: Trajectory, t: Array, signals: dict[str, Array], last: float
     }
 
 
-LOAD = Measure(
-    "Tracking of the load", of="run", function=lambda run: _tracking(run.plan, run.t, run.signals, run.last)
-)
+LOAD = Measure("Tracking of the load", of="run", function=lambda run: _tracking(run.plan, run.t, run.signals, run.last))
 """Measure that returns the metrics of `CRANE_MEASURES` that have no function of their own."""
 
 
