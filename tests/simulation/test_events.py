@@ -397,11 +397,14 @@ def test_events_read_later_are_those_of_simulate(stop):
     later, end = simulate_with_later_events(limited(), T, 1.0, events=events)
     assert now.method == later.method == "compiled"
     copied = pickle.loads(pickle.dumps(later))
-    assert told(later) == told(copied) == told(now) and len(told(now)) > 3
+    assert told(later) == told(copied) == told(now)
+    assert len(told(now)) > 3
     assert np.abs(times_of(later) - times_of(now)).max() <= 1e-12
     assert [one.name for one in later.events].count("u") > 0
-    assert (end is None) == (not stop) and (end is None or (end.stop and later.time[-1] == end.time))
-    assert np.array_equal(later.time, now.time) and np.array_equal(later.outputs, now.outputs)
+    assert (end is None) == (not stop)
+    assert end is None or (end.stop and later.time[-1] == end.time)
+    assert np.array_equal(later.time, now.time)
+    assert np.array_equal(later.outputs, now.outputs)
 
 
 def test_functions_of_the_user_are_not_called_later():
@@ -413,7 +416,9 @@ def test_functions_of_the_user_are_not_called_later():
 
     found, _ = simulate_with_later_events(limited(), T, 1.0, events=[Event(height, high=0.5)])
     count = len(calls)
-    assert count and found.events and len(calls) == count
+    assert count
+    assert found.events
+    assert len(calls) == count
 
 
 # Roots between two samples
@@ -460,7 +465,8 @@ def test_a_value_between_two_samples_is_computed_once():
         return (t - 0.4) ** 3 + 1e-17 * (-1.0) ** seen[t]
 
     found, _ = watched(value)
-    assert len(found) == 1 and abs(found[0].time - 0.4) <= 1e-5
+    assert len(found) == 1
+    assert abs(found[0].time - 0.4) <= 1e-5
     assert max(count for t, count in seen.items() if 0.0 < t < 1.0) == 1
 
 
