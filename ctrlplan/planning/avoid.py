@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 from ctrlplan._checks import check_kind, checked_count, checked_finite
 from ctrlplan._display import Displayed, Facts, Figure, Part, title_of
 from ctrlplan._renamed import warn_renamed
-from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope
+from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope, clearance_within
 from ctrlplan.planning.clearance import clearance as certified_clearance
 from ctrlplan.planning.inequalities import minimised
 from ctrlplan.planning.objectives import plan_length
@@ -35,6 +35,7 @@ Mask = NDArray[np.bool_]
 _MAXIMUM_CLASSES = 3  # maximum number of homotopy classes that are tried,
 _DETOUR = 1.5  # with lengths up to this multiple of the shortest path
 _LONG = 2.0  # length relative to the shortest path above which a warning is issued
+_GIVEN = 1e-4  # gap between the bounds of the clearance of a given plan that violates the required one
 _SAMPLES = 257
 _WINDOW = 8  # samples per constraint, which is on their minimum,
 _FINE = 4  # with finer ones in between
@@ -208,6 +209,8 @@ def avoid(
                 smoothest = min(found, key=lambda avoidance: task.roughness(avoidance.plan))
                 _check_length(smoothest.plan, sum(map(_length, polylines[0])))
                 return smoothest
+    if best is task.given:
+        best = task.certificate(plan)
     x, z = best.position
     points = "with " if task.max_points is None else f"with {task.max_points} via points or fewer and "
     raise ValueError(
@@ -251,8 +254,8 @@ class _Task:
 
     @cached_property
     def given(self) -> Clearance:
-        """Clearance of the given plan."""
-        return self.certificate(self.plan)
+        """Clearance of the given plan; where it violates the required one, for comparisons only."""
+        return clearance_within(_GIVEN, self.plan, self.obstacles, self.load, self.rope, self.required)
 
     @cached_property
     def size(self) -> float:
@@ -330,8 +333,9 @@ def _checked_plan(plan: Trajectory) -> Trajectory:
 
 def _rebuildable(task: _Task) -> WaypointSpline:
     """The given plan, checked to be a spline that can be rebuilt through further waypoints."""
-    plan, given = task.plan, task.given
+    plan = task.plan
     if not isinstance(plan, WaypointSpline):
+        given = task.certificate(plan)
         raise TypeError(
             f"plan must be a WaypointSpline, such as PolySpline, to be led around obstacles, "
             f"got a {type(plan).__name__} with a clearance of {given.minimum:.4g} from obstacles[{given.obstacle}] at "

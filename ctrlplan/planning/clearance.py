@@ -155,6 +155,19 @@ def clearance(
     >>> round(clearance(plan, [Disc((2.0, 3.0), 1.0)], load=0.5).minimum, 5)
     1.5
     """
+    return clearance_within(_TIGHT, plan, obstacles, load, rope, required, max_cells)
+
+
+def clearance_within(
+    gap: float,
+    plan: Trajectory,
+    obstacles: Iterable[Obstacle],
+    load: float,
+    rope: Rope | None,
+    required: float | None,
+    max_cells: int = 200_000,
+) -> Clearance:
+    """Clearance as by `clearance`, within another gap between `lower` and `minimum`, relative to a minimum above 1."""
     things = checked_obstacles(obstacles)
     radius = checked_finite(load, "load", minimum=0.0)
     goal = None if required is None else checked_number(required, "required")
@@ -172,7 +185,7 @@ def clearance(
         spent += cells.centre.size
         bound = search.bound(cells)
         minimum = search.minimum
-        target = minimum - _TIGHT * max(1.0, abs(minimum)) if goal is None or minimum < goal - slack else goal - slack
+        target = minimum - gap * max(1.0, abs(minimum)) if goal is None or minimum < goal - slack else goal - slack
         open_ = bound < target
         if spent + 2 * np.count_nonzero(open_) > max_cells:
             if goal is not None and minimum >= goal - slack:

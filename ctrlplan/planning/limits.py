@@ -427,9 +427,9 @@ class Limited:
         fractions = (np.concatenate([edges[1:], edges[:-1], times]) - plan.start) / plan.duration
         return Sampled(np.concatenate(jet, axis=2), fractions, weights, plan.duration)
 
-    def values(self, jet: Array) -> Array:
-        """Limited signals (nbounds, ntime) of a jet (order + 1, naxes, ntime); 0 for those of a loop."""
-        rows = self._rows(jet, self._local)
+    def values(self, jet: Array, chosen: Sequence[int] | None = None) -> Array:
+        """Limited signals (nbounds, ntime) of a jet (order + 1, naxes, ntime); 0 for those not chosen or of a loop."""
+        rows = self._rows(jet, self._local if chosen is None else chosen)
         if not jet[1:].any():  # at rest, which is no statement about plans that move
             return rows
         for row, b in zip(rows, self.bounds, strict=True):
@@ -649,7 +649,8 @@ class Limited:
         others = [k for k in constant if self.bounds[k].axis is None]
         if others:
             scales = [self.bounds[k].scale for k in others]  # no relative tolerance for a quantity near 0
-            found = function_extrema(plan, lambda jet: self.values(jet)[others], self.order, scales)
+            order = max(self.bounds[k].order for k in others)
+            found = function_extrema(plan, lambda jet: self.values(jet, others)[others], order, scales)
             columns = zip(found.minimum, found.maximum, found.time_min, found.time_max, strict=True)
             for k, column in zip(others, columns, strict=True):
                 yield _margin(self.bounds[k], *column)

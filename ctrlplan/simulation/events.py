@@ -280,14 +280,16 @@ def _root(
     if at_left == 0.0 or at_left * at_right >= 0.0:
         return left if at_left == 0.0 else right
     crossed = [right]
+    known = dict[float, float]()  # a value may differ by rounding when it is computed again
 
     def value(t: float) -> float:
-        if t <= left:
-            return at_left
-        found = at_right if t >= right else function(t)
-        if found * at_right >= 0.0 and t < right:
-            crossed.append(t)
-        return found
+        if t <= left or t >= right:
+            return at_left if t <= left else at_right
+        if t not in known:
+            known[t] = function(t)
+            if known[t] * at_right >= 0.0:
+                crossed.append(t)
+        return known[t]
 
     size = max(abs(left), abs(right), right - left)
     tolerance = 1e-12 * (right - left) + 1e-14 * size

@@ -59,10 +59,10 @@ class Prepared(Displayed):
         Number of states.
     """
 
-    def __init__(self, system: System) -> None:
+    def __init__(self, system: System, known: tuple[object, ...] | None = None) -> None:
         self.original = system
         self._stated: Array | None = None
-        self.fingerprint = fingerprint(system)
+        self.fingerprint = fingerprint(system) if known is None else known
         self.system = state_space(system)
         self.name = str(self.system.name)
         self.input_labels = list(self.system.input_labels or [])
@@ -182,14 +182,15 @@ class Prepared(Displayed):
             If CasADi is missing, or a block cannot be traced; the message names it.
         """
 
-        def build() -> BuiltForm:
-            built = built_once(
-                lambda: self._structure(params), lambda: self._build(params, time_signals, first, state, trials)
-            )
+        def traced() -> BuiltForm:
+            built = self._build(params, time_signals, first, state, trials)
             if self.original is not None:  # the trace has shown which objects the blocks only write
                 self.fingerprint = fingerprint(self.original)
                 _FORMS.get(self.fingerprint, lambda: self)
             return built
+
+        def build() -> BuiltForm:
+            return built_once(lambda: self._structure(params), traced)
 
         return self._built_forms.form(params, build)
 
@@ -425,7 +426,8 @@ def prepared_form(system: System | Prepared) -> Prepared:
                 return system
             system = system.original
         _checked_system(system)
-        return _FORMS.get(fingerprint(system), partial(Prepared, system))
+        found = fingerprint(system)
+        return _FORMS.get(found, partial(Prepared, system, found))
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._display import ROWS, Displayed, Facts, Part, Table, number, shortened
+from ctrlplan._lru import BUILDING
 from ctrlplan._types import Array
 from ctrlplan.simulation.events import Occurrence
 
@@ -40,8 +41,9 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
         Why that method was chosen; where an output is uncertain, also the
         estimated error and the tolerance that suffices. A function without
         arguments returns it when it is first read.
-    events : sequence of Occurrence, optional
-        Crossings of the limits of events, in order of time.
+    events : sequence of Occurrence or callable, optional
+        Crossings of the limits of events, in order of time. A function without
+        arguments returns them when they are first read.
     **labels
         Further arguments of `control.TimeResponseData`.
 
@@ -75,7 +77,6 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
     output_labels: list[str]
     state_labels: list[str]
     method: str
-    events: list[Occurrence]
     _y: Array
     _outputs: Callable[[], Array] | None = None
 
@@ -88,14 +89,15 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
         *,
         method: str = "",
         reason: str | Callable[[], str] = "",
-        events: Sequence[Occurrence] = (),
+        events: Sequence[Occurrence] | Callable[[], Sequence[Occurrence]] = (),
         output_labels: Sequence[str] | None = None,
         **labels: object,
     ) -> None:
         given = np.empty((len(output_labels or ()), np.size(time))) if callable(outputs) else outputs
         super().__init__(time, given, states, inputs, output_labels=output_labels, **labels)
         self._outputs = outputs if callable(outputs) else None
-        self._reason, self.method, self.events = reason, method, list(events)
+        self._reason, self.method = reason, method
+        self._events = events if callable(events) else list(events)
 
     @property
     def y(self) -> Array:
@@ -117,9 +119,19 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
             self._reason = found = found()
         return found
 
+    @property
+    def events(self) -> list[Occurrence]:
+        """Crossings of the limits of events, in order of time."""
+        found = self._events
+        if callable(found):
+            with BUILDING:  # they are located by the solver of the run: one thread at a time
+                found = self._events
+                self._events = found = list(found()) if callable(found) else found
+        return found
+
     def __getstate__(self) -> dict[str, object]:
-        """State with the outputs and the reason, which are otherwise evaluated when they are read."""
-        return self.__dict__ | {"_y": self.y, "_outputs": None, "_reason": self.reason}
+        """State with the outputs, the reason and the events, which are otherwise evaluated when they are read."""
+        return self.__dict__ | {"_y": self.y, "_outputs": None, "_reason": self.reason, "_events": self.events}
 
     def export(self, path: str | os.PathLike[str]) -> Path:
         """Write times and signals to a file, in the format of its ending.

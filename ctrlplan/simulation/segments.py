@@ -60,7 +60,7 @@ _ROUNDINGS = 64.0
 _SEGMENTS = 2_000
 """Maximum number of segments that the declared `longest` step of blocks may cause."""
 
-_FIRST, _LATER = 32.0, 8.0
+_FIRST, _LATER = 8.0, 4.0
 """Length of the first segment, and maximum length of others, as fractions of a run that an event may end."""
 
 _MARKS = 20_000

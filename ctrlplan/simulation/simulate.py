@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from numbers import Real
 from typing import Literal
 
@@ -18,7 +18,7 @@ from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.budget import begin_run
-from ctrlplan.simulation.events import Events, Occurrence, Watched, crossings
+from ctrlplan.simulation.events import Events, Occurrence, Snapshot, Watched, crossings
 from ctrlplan.simulation.interpreted import FeedthroughError
 from ctrlplan.simulation.interruptions import passing_interruptions
 from ctrlplan.simulation.job import Job, Record, fresh_job
@@ -171,6 +171,26 @@ def simulate(
     return response_to(job, chosen)
 
 
+def simulate_with_later_events(
+    system: System | Prepared,
+    timepts: ArrayLike,
+    inputs: Inputs = None,
+    initial_state: ArrayLike | None = None,
+    *,
+    params: Mapping[str, object] | None = None,
+    events: Events = None,
+) -> tuple[SimulationResponse, Occurrence | None]:
+    """Time response as by `simulate`, and the event that ends it.
+
+    Other events are located when they are first read, if that calls no functions of
+    the user: many runs are wanted for their metrics only.
+    """
+    job = checked_job(system, timepts, inputs, initial_state, params=params, events=events)
+    warn_of_unread(job.prepared, job.params)
+    warn_of_timebase(job.prepared)
+    return _response_and_end(job, methods.METHODS, later=True)
+
+
 def checked_job(
     system: System | Prepared,
     timepts: ArrayLike,
@@ -203,11 +223,16 @@ def checked_job(
 
 def response_to(job: Job, chosen: Sequence[Method]) -> SimulationResponse:
     """Response by the first method that applies."""
+    return _response_and_end(job, chosen, later=False)[0]
+
+
+def _response_and_end(job: Job, chosen: Sequence[Method], later: bool) -> tuple[SimulationResponse, Occurrence | None]:
+    """Response by the first method that applies, and the event that ends it; others are located later, if possible."""
     fresh = fresh_job(job)
     try:
-        return _response(job, methods.recorded(job, chosen))
+        return _response(job, methods.recorded(job, chosen), later)
     except FeedthroughError:  # no algebraic loop at the start, but later: repeat with the loop solved from the start
-        return _response(fresh, methods.recorded(replace(fresh, trials=False), chosen))
+        return _response(fresh, methods.recorded(replace(fresh, trials=False), chosen), later)
 
 
 def checked_state(prepared: Prepared, initial_state: ArrayLike | None) -> Array:
@@ -240,25 +265,26 @@ def warn_of_timebase(prepared: Prepared) -> None:
         warnings.warn(_NO_TIMEBASE.format(prepared.name), UserWarning, stacklevel=outside_stacklevel())
 
 
-def _response(job: Job, record: Record) -> SimulationResponse:
-    """Response at the times of a job, up to the event that ends it."""
+def _response(job: Job, record: Record, later: bool) -> tuple[SimulationResponse, Occurrence | None]:
+    """Response at the times of a job, up to the event that ends it, and that event."""
     prepared = job.prepared
-    found = _occurrences(record)
+    found = _Occurrences(record)
     times, states = record.times, record.states
     if times is not job.times and not np.array_equal(times, job.times):
         places = np.searchsorted(times, job.times[job.times <= times[-1]])
         times, states = times[places], states[:, places]
-    last = next((occurrence.time for occurrence in found if occurrence.stop), None)
-    if last is not None:
+    stop = found.stop()
+    if stop is not None:
+        last = stop.time
         end = record.state_at(int(np.searchsorted(record.times, last, side="right")) - 1, last)
         times, states = np.append(times[times < last], last), np.column_stack([states[:, times < last], end])
-        found = [occurrence for occurrence in found if occurrence.time <= last]
     seen = record.snapshot(times, states)
 
     def outputs() -> Array:
         return seen.y.reshape(len(prepared.output_labels), times.size)
 
-    return SimulationResponse(
+    later = later and record.is_pure and not any(callable(event.signal) for event in job.events or ())
+    response = SimulationResponse(
         times,
         outputs if record.is_pure else outputs(),
         states,
@@ -273,19 +299,45 @@ def _response(job: Job, record: Record) -> SimulationResponse:
         plot_inputs=bool(len(seen.u)),
         method=record.method,
         reason=record.reason,
-        events=found,
+        events=found.located if later else found.located(),
     )
+    return response, stop
 
 
-def _occurrences(record: Record) -> list[Occurrence]:
-    """Crossings of the limits of events, in order of time."""
-    if not record.watched:
-        return []
-    seen, found = record.snapshot(record.times, record.states), []
-    with passing_interruptions():
-        for entry in record.watched:
-            found += crossings(entry, record.times, entry.value(seen), partial(_value_at, record, entry))
-    return sorted(found, key=lambda occurrence: occurrence.time)
+class _Occurrences:
+    """Crossings of the limits of the events of a record, located when they are required."""
+
+    def __init__(self, record: Record) -> None:
+        self._record = record
+        self._found: dict[int, list[Occurrence]] = {}
+
+    def stop(self) -> Occurrence | None:
+        """Event that ends the run; None if none does."""
+        self._locate([k for k, entry in enumerate(self._record.watched) if entry.stop])
+        ends = [one for found in self._found.values() for one in found if one.stop]
+        return min(ends, key=lambda one: one.time, default=None)
+
+    def located(self) -> list[Occurrence]:
+        """All crossings up to the end, in order of time."""
+        stop = self.stop()
+        self._locate(range(len(self._record.watched)))
+        last = math.inf if stop is None else stop.time
+        every = [one for k in range(len(self._found)) for one in self._found[k] if one.time <= last]
+        return sorted(every, key=lambda one: one.time)
+
+    @cached_property
+    def _seen(self) -> Snapshot:
+        return self._record.snapshot(self._record.times, self._record.states)
+
+    def _locate(self, wanted: Sequence[int]) -> None:
+        record, missing = self._record, [k for k in wanted if k not in self._found]
+        if not missing:
+            return
+        with passing_interruptions():
+            for k in missing:
+                entry = record.watched[k]
+                values = entry.value(self._seen)
+                self._found[k] = crossings(entry, record.times, values, partial(_value_at, record, entry))
 
 
 def _value_at(record: Record, entry: Watched, k: int, t: float) -> float:

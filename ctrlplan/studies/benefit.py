@@ -389,9 +389,11 @@ def _decisive(wanted: Sequence[str] | None, found: Comparison) -> list[str]:
 
 
 def _only(chosen: Chosen, decisive: Sequence[str]) -> Chosen:
-    """Metrics required for the tables, with those that measures of runs return."""
+    """Metrics required for the tables, with the measures of runs that may return them."""
     own = [one for one in chosen or () if isinstance(one, Measure)]
-    wanted = [one for one in own if one.of in ("", "run") or one.name in decisive]
+    alone = {*MEASURES, *(one.name for one in own if one.of)}
+    returned = any(name not in alone for name in decisive)
+    wanted = [one for one in own if one.name in decisive or (returned and one.of in ("", "run"))]
     return (*wanted, *(name for name in decisive if name in MEASURES))
 
 

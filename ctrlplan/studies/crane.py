@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan import metrics
-from ctrlplan.planning import Fastest, avoid
+from ctrlplan.planning import Fastest, avoid, plan_length
 from ctrlplan.simulation import simulate
 from ctrlplan.simulation.built_forms import shared_forms
+from ctrlplan.simulation.simulate import simulate_with_later_events
 from ctrlplan.studies.choosing import (
     LOAD_RADIUS,
     MARGIN,
@@ -288,7 +289,7 @@ def _limited_error(run: Run, options: _Loop, timepts: Array) -> float:
     response = run.response
     if "force_limits" not in options and _reaches_limits(run):
         loop = crane_loop(CRANE, run.plan, **options | {"force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS})
-        response = simulate(loop, timepts, events=(SLACK,))
+        response, _ = simulate_with_later_events(loop, timepts, events=(SLACK,))
     if response.time[-1] < timepts[-1]:
         return np.nan
     signals = signals_of(response)
@@ -487,11 +488,9 @@ def _length_curves() -> Curves:
     rows = {}
     for duration in (14.0, 16.0, 20.0):
         points = obstacle_waypoints(duration)
-        t = np.linspace(0.0, duration, 2001)
-        lengths = [float(metrics.path_length(t, TrigSpline(points, alpha=a, warn=False)(t))) for a in alphas.tolist()]
+        lengths = [plan_length(TrigSpline(points, alpha=a, warn=False)) for a in alphas.tolist()]
         rows[f"one plan, {duration:g} s"] = np.array(lengths)
-        segments = float(metrics.path_length(t, PiecewiseSpline(points)(t)))
-        rows[f"one quintic per segment, {duration:g} s"] = np.full(alphas.size, segments)
+        rows[f"one quintic per segment, {duration:g} s"] = np.full(alphas.size, plan_length(PiecewiseSpline(points)))
     return Curves(
         "alpha [rad] (0: polynomial)",
         "path length [m]",

@@ -41,8 +41,16 @@ _LOAD = (
 CRANE_MEASURES = {
     "error_travel": Measure("Peak tracking error during the move", "m", definition=_LOAD),
     "error_after": Measure("Peak tracking error after the move (residual)", "m", definition=_LOAD),
-    "sway_after": Measure("Residual sway", "rad", definition=_LOAD),
-    "force_peak": Measure("Peak trolley force", "N"),
+    "sway_after": Measure(
+        "Residual sway",
+        "rad",
+        of="run",
+        function=lambda run: _residual_sway(run.t, run.signals, run.last),
+        definition=_LOAD,
+    ),
+    "force_peak": Measure(
+        "Peak trolley force", "N", of="run", function=lambda run: _limited_peak(run.t, run.signals["F"])
+    ),
     "error_limited": Measure("Peak tracking error with limited drives", "m", definition=_LOAD),
     "slack_time": Measure("Time with slack rope", "s"),
     "path_length": Measure("Path length of the plan", "m"),
@@ -93,8 +101,15 @@ def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -
     dict of str to float
         The keys of `CRANE_MEASURES`.
     """
-    t = np.asarray(response.time)
-    signals = signals_of(response)
+    t, signals = np.asarray(response.time), signals_of(response)
+    return _tracking(plan, t, signals, last) | {
+        "sway_after": _residual_sway(t, signals, last),
+        "force_peak": _limited_peak(t, signals["F"]),
+    }
+
+
+def _tracking(plan: Trajectory, t: Array, signals: dict[str, Array], last: float) -> dict[str, float]:
+    """Tracking error of the load, time with a slack rope, and path lengths."""
     load = np.stack([signals["x"], signals["z"]])
     error = np.hypot(*(load - plan.jet(t, 0)[0]))
     during, after = t <= last, t >= last
@@ -103,8 +118,6 @@ def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -
     return {
         "error_travel": _peak(t[during], error[during]),
         "error_after": _peak(t[after], error[after]),
-        "sway_after": _peak(t[after], signals["theta"][after]),
-        "force_peak": _limited_peak(t, signals["F"]),
         "slack_time": slack
         if slack > 1e-9 * (t[-1] - t[0])
         else 0.0,  # at the event itself the tension is 0 up to rounding
@@ -113,8 +126,14 @@ def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -
     }
 
 
-LOAD = Measure("Tracking of the load", of="run", function=lambda run: load_metrics(run.plan, run.response, run.last))
-"""Measure that returns the metrics of `CRANE_MEASURES`."""
+LOAD = Measure("Tracking of the load", of="run", function=lambda run: _tracking(run.plan, run.t, run.signals, run.last))
+"""Measure that returns the metrics of `CRANE_MEASURES` that have no function of their own."""
+
+
+def _residual_sway(t: Array, signals: dict[str, Array], last: float) -> float:
+    """Peak angle of the rope from the time of the last waypoint on."""
+    after = t >= last
+    return _peak(t[after], signals["theta"][after])
 
 
 def _limited_peak(t: Array, values: Array) -> float:

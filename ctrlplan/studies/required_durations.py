@@ -53,9 +53,10 @@ def required_duration(name: str, plan: Trajectory, fast: Trajectory, limited: Li
         return RequiredDuration(name, math.nan, "position jumps: no limit on a derivative can hold", "violated")
     try:
         limited.check_smooth(plan)
-        worst = limited.margins(plan).active
+        margins = limited.margins(plan)
+        worst = margins.active
         satisfied = "satisfied" if worst.fraction >= -SAME else f"{worst.bound.name} exceeded by {worst.share}"
-        shortest = limited.margins(fast)
+        shortest = margins if fast is plan else limited.margins(fast)
         duration = fast.duration
         if fast is plan or not shortest.satisfied:
             found = fastest_within(fast, limited)

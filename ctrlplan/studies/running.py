@@ -18,11 +18,11 @@ from ctrlplan.simulation import (
     Prepared,
     check_begin,
     equilibrium_at,
-    simulate,
     state_space,
     unchanged,
     unstable_poles,
 )
+from ctrlplan.simulation.simulate import simulate_with_later_events
 from ctrlplan.studies.connections import check_reached
 from ctrlplan.studies.measures import Run, checked_names
 from ctrlplan.trajectories import Trajectory
@@ -84,15 +84,14 @@ def run_plan(
             doubt = f"{name}: {_doubt(plan, times, state, why)}." if why else ""
         inputs, start = (plan if ready.ninputs else None), (0.0 if state is None else state)
         try:
-            response = simulate(ready, times, inputs, initial_state=start, params=params, events=events)
+            response, stop = simulate_with_later_events(ready, times, inputs, start, params=params, events=events)
         except Exception as error:
             if doubt:
                 error.add_note(doubt)
             raise
     if doubt:
         warnings.warn(doubt, UserWarning, stacklevel=outside_stacklevel())
-    early = response.time[-1] < times[-1]
-    stop = next(event for event in response.events if event.stop) if early else None
+    stop = stop if response.time[-1] < times[-1] else None
     return Run(plan, system, response, tracked, acting, last, _unstable(ready), doubt, stop)
 
 

@@ -1,6 +1,7 @@
 """Crossings of limits compared with closed forms, by every method, and runs that end there."""
 
 import math
+import pickle
 
 import control as ct
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.optimize import brentq
 import ctrlplan as cp
 from ctrlplan.simulation import Event, Occurrence
 from ctrlplan.simulation.events import Watched, crossings
+from ctrlplan.simulation.simulate import simulate_with_later_events
 
 METHODS = ("exact", "compiled", "python")
 ALLOWED = {"exact": 1e-12, "compiled": 1e-7, "python": 1e-7}
@@ -370,6 +372,55 @@ def test_an_event_alone_is_no_sequence():
         cp.simulate(LAG, T, 1.0, events=Event("y", high=0.5))
 
 
+# Events that are located when they are read
+
+
+def limited():
+    """Saturated PID of a nonlinear plant: compiled, with events that its blocks declare."""
+    plant = ct.nlsys(
+        lambda t, x, u, params: np.array([x[1], u[0] - np.sin(x[0])]),
+        lambda t, x, u, params: x[:1],
+        inputs="u",
+        outputs="y",
+        states=2,
+        name="pendulum",
+    )
+    limits = cp.create_saturation_iosystem(-1.5, 1.5, inputs="v", outputs="u", name="limits")
+    gain = ct.ss([], [], [], [[40.0, -40.0]], inputs=["r", "y"], outputs="v", name="gain")
+    return ct.interconnect([gain, limits, plant], inputs="r", outputs=["y", "u"], name="limited")
+
+
+@pytest.mark.parametrize("stop", [False, True])
+def test_events_read_later_are_those_of_simulate(stop):
+    events = [Event("y", high=0.9, stop=stop), Event("y", low=0.25, high=0.75)]
+    now = cp.simulate(limited(), T, 1.0, events=events)
+    later, end = simulate_with_later_events(limited(), T, 1.0, events=events)
+    assert now.method == later.method == "compiled"
+    copied = pickle.loads(pickle.dumps(later))
+    assert told(later) == told(copied) == told(now)
+    assert len(told(now)) > 3
+    assert np.abs(times_of(later) - times_of(now)).max() <= 1e-12
+    assert [one.name for one in later.events].count("u") > 0
+    assert (end is None) == (not stop)
+    assert end is None or (end.stop and later.time[-1] == end.time)
+    assert np.array_equal(later.time, now.time)
+    assert np.array_equal(later.outputs, now.outputs)
+
+
+def test_functions_of_the_user_are_not_called_later():
+    calls = []
+
+    def height(t, x, u, y):
+        calls.append(t.size)
+        return y[0]
+
+    found, _ = simulate_with_later_events(limited(), T, 1.0, events=[Event(height, high=0.5)])
+    count = len(calls)
+    assert count
+    assert found.events
+    assert len(calls) == count
+
+
 # Roots between two samples
 
 
@@ -403,6 +454,20 @@ def test_roots_between_two_samples(value, time):
     assert [o.kind for o in found] == ["above"]
     assert abs(found[0].time - time) <= 2e-12
     assert value(found[0].time) >= 0.0
+
+
+def test_a_value_between_two_samples_is_computed_once():
+    """Its rounding may differ the next time, also in its sign."""
+    seen = {}
+
+    def value(t):
+        seen[t] = seen.get(t, 0) + 1
+        return (t - 0.4) ** 3 + 1e-17 * (-1.0) ** seen[t]
+
+    found, _ = watched(value)
+    assert len(found) == 1
+    assert abs(found[0].time - 0.4) <= 1e-5
+    assert max(count for t, count in seen.items() if 0.0 < t < 1.0) == 1
 
 
 def test_few_values_locate_a_crossing():

@@ -736,3 +736,29 @@ def test_no_plan_is_run_twice():
         assert grid.values[row, 1] == found.comparison.metrics["trigonometric"][key]
         for name, values in grid.baselines.items():
             assert values[row] == found.comparison.metrics[name][key] or math.isnan(values[row])
+
+
+def test_the_tables_compute_only_the_measures_of_runs_that_they_show():
+    seen = []
+
+    def counted(key):
+        def value(run):
+            seen.append(key)
+            return float(np.abs(run.signals["u"]).max())
+
+        return cp.Measure(key, of="run", function=value)
+
+    measures = {"first": counted("first"), "second": counted("second")}
+    found = worth(loop(5.0), MOVE, TIMES, measures=measures, alpha=1.0, decisive=("first",), **TABLES)
+    # The comparison of all plans has both; what the table adds has the first only.
+    assert seen.count("second") == len(found.comparison.plans) < seen.count("first")
+    assert np.isfinite(found.grids[0].values).all()
+
+
+def test_the_tables_keep_measures_of_runs_that_return_what_they_show():
+    def values(run):
+        return {"largest": float(np.abs(run.signals["u"]).max()), "other": 1.0}
+
+    measures = {"largest": cp.Measure("Largest"), "both": cp.Measure("Both", of="run", function=values)}
+    found = worth(loop(5.0), MOVE, TIMES, measures=measures, alpha=1.0, decisive=("largest",), **TABLES)
+    assert np.isfinite(found.grids[0].values).all()
