@@ -4,8 +4,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.metrics._error import squared
-from ctrlplan.metrics._pieces import peaks, pieces
-from ctrlplan.metrics._records import QUIET, Array, Value, diverged, each, fitted, plain, real, times
+from ctrlplan.metrics._evaluation import Evaluation, Later, evaluated
+from ctrlplan.metrics._pieces import cubics
+from ctrlplan.metrics._records import Array, Value, diverged, each, fitted, real, times
 from ctrlplan.metrics._records import signal as checked
 
 _AT_LIMIT = 1e-9  # distance from a limit, relative to the range, that counts as saturation
@@ -44,8 +45,7 @@ def effort(timepts: ArrayLike, u: ArrayLike) -> Value:
     3.141593
     """
     t = times(timepts)
-    control = checked(u, "u", t)
-    return squared(t, control)
+    return squared(t, checked(u, "u", t), "u")
 
 
 def peak(timepts: ArrayLike, signal: ArrayLike) -> Value:
@@ -80,10 +80,7 @@ def peak(timepts: ArrayLike, signal: ArrayLike) -> Value:
     2.25
     """
     t = times(timepts)
-    record = checked(signal, "signal", t)
-    rows = record.reshape(-1, t.size)
-    with np.errstate(**QUIET):
-        return plain(peaks(t, rows), record.shape[:-1])
+    return evaluated(magnitude, t, checked(signal, "signal", t), "signal")
 
 
 def total_variation(timepts: ArrayLike, signal: ArrayLike) -> Value:
@@ -171,11 +168,16 @@ def saturation_time(timepts: ArrayLike, u: ArrayLike, lower: ArrayLike, upper: A
     return each(lambda u, low, high: _saturated(t, u, float(low), float(high)), control.shape[:-1], control, low, high)
 
 
+def magnitude(evaluation: Evaluation, rows: slice) -> Later:
+    """Return the peak magnitudes of signals."""
+    return evaluation.maxima(rows, np.zeros(rows.stop - rows.start))
+
+
 def variation(t: Array, f: Array) -> float:
     """Return the total variation of one record (ntime,)."""
     if diverged(f):
         return np.inf
-    p = pieces(t, f)
+    p = cubics(t, f)
     return float(np.abs(np.diff(p.values, axis=0)).sum())
 
 
@@ -198,7 +200,7 @@ def _beyond(t: Array, g: Array, tolerance: float) -> float:
     leaves = np.flatnonzero(resting[:-1] & ~at[1:])
     free = np.ones(t.size - 1, dtype=np.bool_)
     free[stays] = free[enters] = free[leaves] = False
-    p = pieces(t, g, np.flatnonzero(free))
+    p = cubics(t, g)[free]
     values = p.values
     mixed = (values.min(axis=0) < 0) & (values.max(axis=0) > 0)
     crossed = p[mixed]

@@ -5,7 +5,8 @@ from numpy.typing import ArrayLike
 
 from ctrlplan.metrics._control import variation
 from ctrlplan.metrics._error import squared
-from ctrlplan.metrics._pieces import Pieces, maximum, pieces
+from ctrlplan.metrics._evaluation import Evaluation
+from ctrlplan.metrics._pieces import Pieces, cubics
 from ctrlplan.metrics._records import Array, axes, diverged, each, times, waypoints
 
 _SWING = 1e-6  # of the waypoints' bounding box: smaller reversals are rounding
@@ -235,8 +236,9 @@ def outside_box(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float
         low, high = polyline.min(axis=1, keepdims=True), polyline.max(axis=1, keepdims=True)
         beyond = np.maximum(low - positions, positions - high)
         # The distance is not smooth where the path enters the box; those of single axes are.
-        sides = [maximum(t, side) for p in (low - positions, positions - high) for side in p]
-        return max(maximum(t, np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=0))), *sides, 0.0)
+        corner = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=0, keepdims=True))
+        evaluation, sides = Evaluation(t), np.concatenate([corner, low - positions, positions - high])
+        return float(evaluation.maxima(evaluation.add(sides, "path"), np.ones(len(sides)))().max(initial=0.0))
 
     return float(each(distance, (), positions))
 
@@ -278,13 +280,13 @@ def jerk_cost(timepts: ArrayLike, jerk: ArrayLike) -> float:
     """
     t = times(timepts)
     jerks = axes(jerk, "jerk", t)
-    return float(np.sum(squared(t, jerks)))
+    return float(np.sum(squared(t, jerks, "jerk")))
 
 
 def _length(t: Array, path: Array) -> float:
     if diverged(path):
         return np.inf
-    curves = [pieces(t, p) for p in path]
+    curves = [cubics(t, p) for p in path]
     cuts = np.sort(np.concatenate([p.cuts for p in curves]), axis=0)
     turns = np.asarray(((cuts > 0) & (cuts < 1)).any(axis=0))
     return _arc([p[~turns] for p in curves], None) + _arc([p[turns] for p in curves], cuts[:, turns])

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.metrics._pieces import Bulges, maxima, pieces
-from ctrlplan.metrics._records import HUGE, QUIET, Array, Value, finite, fitted, instant, plain, signal, times
+from ctrlplan.metrics._evaluation import Evaluation, Later, evaluated
+from ctrlplan.metrics._records import QUIET, Array, Value, finite, fitted, instant, signal, times
 
 _ROUNDING = 4 * np.finfo(np.float64).eps  # of the levels: a response on the edge of the band is inside
 
@@ -225,37 +225,31 @@ def _settling(
     width = finite(band, "band")
     if width.ndim or width <= 0:
         raise ValueError(f"band must be a positive fraction of the change, got {band}")
-    reference = fitted(reference, "reference", y.shape)
+    e = y - fitted(reference, "reference", y.shape)
     since = instant(start, t)
-    edges = width * np.abs(target - origin) + _ROUNDING * np.maximum(np.abs(target), np.abs(origin))
-    with np.errstate(**QUIET):
-        entries = _last_entries(t, (y - reference).reshape(-1, t.size), edges.ravel()).reshape(lead)
-        return plain(np.where(target == origin, np.nan, np.maximum(entries - since, 0.0)), lead)
+
+    def wanted(evaluation: Evaluation, rows: slice, target: Array, origin: Array) -> Later:
+        return settled(evaluation, rows, target, origin, float(width), since)
+
+    return evaluated(wanted, t, e, "y", target, origin)
 
 
-def _last_entries(t: Array, e: Array, edges: Array) -> Array:
-    """Return the times from which on abs(e) <= edge, for rows e (nrows, ntime).
+def settled(evaluation: Evaluation, rows: slice, target: Array, origin: Array, band: float, since: float) -> Later:
+    """Return the settling times of signals, each the difference of a response from its target or reference."""
+    rounding = _ROUNDING * np.maximum(np.abs(target), np.abs(origin))
+    entries = evaluation.entries(rows, band * np.abs(target - origin) + rounding)
+    return lambda: np.where(target == origin, np.nan, np.maximum(entries() - since, 0.0))
 
-    -inf if always, inf if e is outside after the last sample but one.
-    """
-    bulges = Bulges(t)
-    low, high = bulges.extrema(e)
-    peaks = np.maximum(-low, high)
-    never = (np.abs(e[:, -1]) > edges) | ~(peaks.max(axis=1) < HUGE)
-    found = np.where(never, np.inf, -np.inf)
-    first = np.minimum(bulges.last_beyond(e, edges, peaks), t.size - 2)
-    rows, chosen = bulges.beyond(e, np.abs, np.where(never, np.nan, edges), (low, high), first)
-    p = pieces(t, e, chosen, rows)
-    cuts, values = p.cuts, p.values
-    beyond = np.abs(values) > edges[rows]
-    leaving = np.flatnonzero(beyond.any(axis=0))
-    last = leaving[np.append(np.diff(rows[leaving]) > 0, True)[: leaving.size]]
-    cut = 3 - beyond[::-1, last].argmax(axis=0)
-    level = np.copysign(edges[rows[last]], values[cut, last])
-    here = p[last]
-    entered = here.time(here.crossing(level, cuts[cut, last], cuts[cut + 1, last]))
-    found[rows[last]] = np.where(chosen[last] == t.size - 2, np.inf, entered)
-    return found
+
+def exceeded(evaluation: Evaluation, rows: slice, change: Array, side: float) -> Later:
+    """Return the overshoots, in percent of the change, of signals as above; for the side -1, of their negatives."""
+    maxima = evaluation.maxima(rows, side * np.where(change < 0, -1.0, 1.0), extrapolated=False)
+
+    def percent() -> Array:
+        with np.errstate(**QUIET):
+            return 100 * np.maximum(maxima(), 0.0) / np.where(change == 0, np.nan, np.abs(change))
+
+    return percent
 
 
 def _excess(
@@ -267,11 +261,7 @@ def _excess(
     target = fitted(finite(final, "final"), "final", lead)
     origin = fitted(finite(initial, "initial"), "initial", lead)
     followed = target[..., None] if reference is None else finite(reference, "reference")
-    followed = fitted(followed, "reference", response.shape)
-
-    change = target - origin
-    with np.errstate(**QUIET):
-        ahead = response - followed
-        ahead *= side * np.sign(change)[..., None]
-        excess = maxima(t, ahead.reshape(-1, t.size), extrapolated=False).reshape(lead)
-        return plain(np.where(change == 0, np.nan, 100 * np.maximum(excess, 0.0) / np.abs(change)), lead)
+    e = response - fitted(followed, "reference", response.shape)
+    return evaluated(
+        lambda evaluation, rows, change: exceeded(evaluation, rows, change, side), t, e, "y", target - origin
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, TypeAlias, get_args
 
 import control as ct
@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from ctrlplan import metrics
 from ctrlplan._display import MISSING, ROWS, Displayed, Facts, Part, number
 from ctrlplan._types import Array
-from ctrlplan.metrics._pieces import shared
+from ctrlplan.metrics._control import magnitude
+from ctrlplan.metrics._error import absolute
+from ctrlplan.metrics._evaluation import TOGETHER, Evaluation, Later
+from ctrlplan.metrics._response import exceeded, settled
 from ctrlplan.planning import SquaredDerivative
 from ctrlplan.simulation import Occurrence, Prepared, SimulationResponse
 from ctrlplan.trajectories import Trajectory, Waypoint
@@ -246,6 +249,48 @@ class Measure(Displayed):
         )
 
 
+@dataclass(frozen=True)
+class _Shared:
+    """Function of a `Tracked` or `Acting` whose computation is shared with others of the same signals."""
+
+    start: Callable[[Evaluation, Any], Later]
+
+    def __call__(self, seen: Tracked | Acting) -> Array:
+        return self.start(Evaluation(seen.t), seen)()
+
+
+def _settling(signal: str) -> _Shared:
+    """Settling time of a signal of a `Tracked`, `error` or `remainder`."""
+    return _Shared(
+        lambda evaluation, seen: settled(
+            evaluation, evaluation.add(getattr(seen, signal), "y"), seen.final, seen.origin, seen.band, seen.start
+        )
+    )
+
+
+def _exceeding(signal: str, side: float) -> _Shared:
+    """Overshoot for the side -1 of a signal, which is a reference minus an output, or lag for the side 1."""
+    return _Shared(
+        lambda evaluation, seen: exceeded(
+            evaluation, evaluation.add(getattr(seen, signal), "y"), seen.final - seen.origin, side
+        )
+    )
+
+
+def _area(signal: str, timed: bool = False) -> _Shared:
+    """Integral of the magnitude of a signal, or of this times the time since the start."""
+    return _Shared(
+        lambda evaluation, seen: absolute(
+            evaluation, evaluation.add(getattr(seen, signal), "error"), seen.start if timed else None
+        )
+    )
+
+
+def _square(signal: str) -> _Shared:
+    """Integral of the square of a signal."""
+    return _Shared(lambda evaluation, seen: evaluation.squares(evaluation.add(getattr(seen, signal), signal)))
+
+
 def _of_path(metric: Callable[[Array, Array, Array], float | Array]) -> Callable[[Path], float | Array]:
     """Metric of a path and its waypoints; nan for steps, which have no path."""
     return lambda seen: np.nan if seen.steps else metric(seen.t, seen.path, seen.points)
@@ -282,85 +327,86 @@ MEASURES = {
         "Settling time",
         "s",
         "response",
-        lambda seen: metrics.settling_time(seen.t, seen.y, seen.final, seen.origin, band=seen.band, start=seen.start),
+        _settling("remainder"),
         definition=_SETTLING,
     ),
     "tracking_settling_time": Measure(
         "Settling time of the tracking error",
         "s",
         "response",
-        lambda seen: metrics.tracking_settling_time(
-            seen.t, seen.y, seen.reference, seen.final, seen.origin, band=seen.band, start=seen.start
-        ),
+        _settling("error"),
         definition=_SETTLING,
     ),
     "overshoot_error": Measure(
         "Overshoot on the tracking error",
         "%",
         "response",
-        lambda seen: metrics.overshoot(seen.t, seen.y, seen.final, seen.origin, reference=seen.reference),
+        _exceeding("error", -1.0),
         definition=_PERCENT,
     ),
     "overshoot_final": Measure(
         "Overshoot on the final value",
         "%",
         "response",
-        lambda seen: metrics.overshoot(seen.t, seen.y, seen.final, seen.origin),
+        _exceeding("remainder", -1.0),
         definition=_PERCENT,
     ),
     "lag_error": Measure(
         "Peak lag behind the reference",
         "%",
         "response",
-        lambda seen: metrics.lag(seen.t, seen.y, seen.final, seen.origin, reference=seen.reference),
+        _exceeding("error", 1.0),
         definition=_PERCENT,
     ),
     "iae": Measure(
         "IAE of the tracking error",
         "{y} s",
         "response",
-        lambda seen: metrics.iae(seen.t, seen.error),
+        _area("error"),
         definition=_ERROR,
     ),
     "ise": Measure(
         "ISE of the tracking error",
         "{y}^2 s",
         "response",
-        lambda seen: metrics.ise(seen.t, seen.error),
+        _square("error"),
         definition=_ERROR,
     ),
     "itae": Measure(
         "ITAE of the tracking error",
         "{y} s^2",
         "response",
-        lambda seen: metrics.itae(seen.t, seen.error, start=seen.start),
+        _area("error", timed=True),
         definition=_ERROR,
     ),
     "iae_final": Measure(
         "IAE relative to the final value",
         "{y} s",
         "response",
-        lambda seen: metrics.iae(seen.t, seen.remainder),
+        _area("remainder"),
         definition=_ERROR,
     ),
     "ise_final": Measure(
         "ISE relative to the final value",
         "{y}^2 s",
         "response",
-        lambda seen: metrics.ise(seen.t, seen.remainder),
+        _square("remainder"),
         definition=_ERROR,
     ),
     "itae_final": Measure(
         "ITAE relative to the final value",
         "{y} s^2",
         "response",
-        lambda seen: metrics.itae(seen.t, seen.remainder, start=seen.start),
+        _area("remainder", timed=True),
         definition=_ERROR,
     ),
-    "control_peak": Measure("Peak control", "{u}", "control", lambda seen: metrics.peak(seen.t, seen.u)),
-    "control_effort": Measure(
-        "Control effort", "{u}^2 s", "control", lambda seen: metrics.effort(seen.t, seen.u), definition=_CONTROL
+    "control_peak": Measure(
+        "Peak control",
+        "{u}",
+        "control",
+        _Shared(lambda evaluation, seen: magnitude(evaluation, evaluation.add(seen.u, "u"))),
     ),
+    "control_effort": Measure("Control effort", "{u}^2 s", "control", _square("u"), definition=_CONTROL),
     "control_variation": Measure(
         "Total variation of the control",
         "{u}",
@@ -494,41 +540,49 @@ def signal_metrics(
     """
     known = slice(int(np.searchsorted(record.t, start)), None)  # no copy of the rows
     t, course = record.t[known], _Course.of(plan, record.t[known])
-    parts, count = [], max(1, _TOGETHER // record.t.size)
+    parts, count = [], max(1, TOGETHER // record.t.size)
     for first in range(0, len(record.y), count):
         some = slice(first, first + count)
         y, u = record.y[some, :, known], record.u[some, :, known]
-        kinds: list[tuple[Kind, Sequence[Tracked | Acting], tuple[str, ...]]] = [
+        kinds: list[_Seen] = [
             ("response", _tracked(t, y, course, band, start), record.axes),
             ("control", [Acting(t, rows, start) for rows in _rows(u)], record.controls),
         ]
-        parts.append(_values(kinds, measures, record.unstable[some]))
+        parts.append(_values(kinds, measures, record.unstable[some], Evaluation(t)))
+    if len(parts) == 1:
+        return parts[0]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
 
 
+_Seen = tuple[Kind, "Sequence[Tracked | Acting]", tuple[str, ...]]
+
+
 def _values(
-    kinds: list[tuple[Kind, Sequence[Tracked | Acting], tuple[str, ...]]],
-    measures: Mapping[str, Measure],
-    unstable: NDArray[np.bool_],
+    kinds: list[_Seen], measures: Mapping[str, Measure], unstable: NDArray[np.bool_], evaluation: Evaluation
 ) -> dict[str, Array]:
     """Metrics of the signals of each kind, by label, of loops that are unstable or not."""
     found: dict[str, Array] = {}
-    for kind, seen, labels in kinds:
-        tables = {}
-        with shared():  # measures share the cubics of a signal
-            for name, function in _functions(kind, measures) if labels else ():
-                tables[name] = _table(function, seen, len(unstable))
-        for name in tables:
-            if name in SETTLING_TIMES:
+    wanted = [
+        {name: [_later(function, evaluation, one) for one in seen] for name, function in _functions(kind, measures)}
+        for kind, seen, labels in kinds
+        if labels
+    ]
+    for own, labels in zip(wanted, (labels for _, _, labels in kinds if labels), strict=True):
+        tables = {name: _table([value() for value in values], len(unstable)) for name, values in own.items()}
+        for name in SETTLING_TIMES if unstable.any() else ():
+            if name in tables:
                 tables[name][unstable] = np.inf
-        found |= {name: np.fmax.reduce(table, axis=1) for name, table in tables.items()}
+        if tables:
+            found |= dict(zip(tables, np.fmax.reduce(np.array(list(tables.values())), axis=2), strict=True))
         for name, table in tables.items() if len(labels) > 1 else ():
             found |= {f"{name}_{label}": row for label, row in zip(labels, table.T, strict=True)}
     return found
 
 
-_TOGETHER = 2**18
-"""Maximum number of samples of a signal over the loops whose metrics are computed together, for their memory."""
+def _later(function: Function, evaluation: Evaluation, seen: Tracked | Acting) -> Callable[[], Any]:
+    """Value of a measure, whose computation is shared if possible, when it is called."""
+    return function.start(evaluation, seen) if isinstance(function, _Shared) else partial(function, seen)
+
 
 SETTLING_TIMES = ("settling_time", "tracking_settling_time")
 """Metrics that are infinite for an unstable loop, and discontinuous along a parameter."""
@@ -565,9 +619,9 @@ def _tracked(t: Array, y: Array, course: _Course, band: float, start: float) -> 
     return found
 
 
-def _table(function: Function, seen: Sequence[Tracked | Acting], nloops: int) -> Array:
-    """Values (nloops, nsignals) of a measure."""
-    values = [np.atleast_1d(np.asarray(function(one), dtype=float)) for one in seen]
+def _table(found: Sequence[Any], nloops: int) -> Array:
+    """Values (nloops, nsignals) of a measure, from those of each signal."""
+    values = [np.atleast_1d(np.asarray(one, dtype=float)) for one in found]
     if nloops == 1:
         return values[0].reshape(1, -1).copy()
     table = np.stack(values, axis=1)

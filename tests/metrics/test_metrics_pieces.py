@@ -1,5 +1,6 @@
 """What metrics take a signal for between its samples: exact where it can be, sane where it cannot."""
 
+import threading
 from dataclasses import fields
 
 import numpy as np
@@ -9,9 +10,21 @@ from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
 from ctrlplan import metrics
-from ctrlplan.metrics._pieces import Smooth, maxima, pieces, shared
+from ctrlplan.metrics._evaluation import Evaluation
+from ctrlplan.metrics._grid import Grid
+from ctrlplan.metrics._pieces import cubics, cubics_of_rows
 
 UNEVEN = np.array([-1.0, -0.7, 0.1, 0.3, 0.9, 1.0, 1.8, 2.5])
+
+
+def held(p, s):
+    """Return the values at s with each jump in the middle of its interval, as in the trapezoidal rule."""
+    return np.where(p.jump, np.where(s < 0.5, p.a, p.end), p(s))
+
+
+def maxima(t, f):
+    evaluation = Evaluation(t)
+    return evaluation.maxima(evaluation.add(f, "f"), np.ones(len(f)))()
 
 
 @pytest.mark.parametrize("count", [4, 5, 6, 8])
@@ -148,19 +161,61 @@ def test_any_staircase_is_what_its_samples_say(levels, width):
 
 
 @pytest.mark.parametrize("count", [2, 3, 50, 700])
-def test_metrics_that_share_cubics_are_those_alone(count):
-    """Of several rows together, of one of them, and of an array that holds one signal after the other."""
+def test_metrics_that_are_evaluated_together_are_those_alone(count):
+    """Of several signals and one of them, in any order: to the bit."""
     t = np.linspace(0.0, 3.0, count)
     rows = np.array([np.sin(3.0 * t), np.cos(2.0 * t) - 0.3, np.where(t > 1.0, 1.0, -0.5)])
-    functions = (metrics.ise, metrics.iae, metrics.itae, metrics.effort, metrics.total_variation)
-    alone = [function(t, own) for own in (rows, rows[0], 2.0 * rows) for function in functions]
-    held = rows.copy()
-    with shared():
-        found = [function(t, own) for own in (held, held[0]) for function in functions]
-        held *= 2.0
-        found += [function(t, held) for function in functions]
-    for one, other in zip(found, alone, strict=True):
-        np.testing.assert_array_equal(one, other)
+    signals, edges, sides = (2.0 * rows, rows[:1]), np.array([0.1, 0.4, 2.0]), np.array([1.0, -1.0, 0.0])
+
+    def wanted(evaluation, f):
+        own, n = evaluation.add(f, "f"), len(f)
+        found = [evaluation.entries(own, edges[:n]), evaluation.maxima(own, sides[:n]), evaluation.areas(own)]
+        return [*found, evaluation.maxima(own, -sides[:n], extrapolated=False), evaluation.squares(own)]
+
+    evaluation = Evaluation(t)
+    together = [one for f in signals for one in wanted(evaluation, f)]
+    alone = [one() for f in signals for k in range(5) for one in [wanted(Evaluation(t), f)[k]]]
+    for one, other in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(one(), other)
+    second = Evaluation(t)
+    own = second.add(signals[0][1:2], "f")
+    found = second.entries(own, edges[1:2]), second.maxima(own, sides[1:2]), second.areas(own), second.squares(own)
+    for one, other in zip(found, (*alone[:3], alone[4]), strict=True):
+        np.testing.assert_array_equal(one(), other[..., 1:2])
+
+
+def test_sample_times_of_one_length_are_not_confused():
+    """In one thread, and in several at once that use more times than are kept; an array whose values change."""
+    f = np.sin(np.linspace(0.0, 3.0, 700))
+    scales = [1.0 + k / 8 for k in range(12)]
+    expected = [metrics.iae(np.linspace(0.0, 1.0, 700), f) * scale for scale in scales]
+    found = {}
+
+    def measure(begin):
+        for _ in range(5):
+            for k in range(begin, 12, 3):
+                found.setdefault(k, []).append(metrics.iae(np.linspace(0.0, scales[k], 700), f))
+
+    threads = [threading.Thread(target=measure, args=(k,)) for k in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for k, values in found.items():
+        assert values == [pytest.approx(expected[k], rel=1e-13)] * 5
+    t = np.linspace(0.0, 1.0, 700)
+    metrics.iae(t, f)
+    t *= 2.0
+    assert metrics.iae(t, f) == pytest.approx(2.0 * expected[0], rel=1e-13)
+
+
+@pytest.mark.parametrize("metric", [metrics.iae, metrics.itae, metrics.ise, metrics.peak])
+@pytest.mark.parametrize("shift", [1e-9, 1e-3])
+def test_a_sample_next_to_another_changes_little(metric, shift):
+    """Even samples with three more close to others, as at the breakpoints of a plan: fourth order all the same."""
+    t = np.linspace(0.0, 3.0, 801)
+    more = np.sort(np.append(t, t[[1, 400, 798]] + shift))
+    assert metric(more, np.sin(5.0 * more)) == pytest.approx(metric(t, np.sin(5.0 * t)), rel=2e-9)
 
 
 SIGNALS = {
@@ -180,39 +235,38 @@ def test_integrals_and_peaks_of_long_signals_are_those_of_every_cubic(kind, spre
     t = np.linspace(0.0, 3.0, 800)
     t[1:-1] += spread * t[1] * np.random.default_rng(1).uniform(-0.5, 0.5, 798)
     f = SIGNALS[kind](t)
-    cubics, (nodes, weights) = pieces(t, f), np.polynomial.legendre.leggauss(4)
+    p, (nodes, weights) = cubics(t, f), np.polynomial.legendre.leggauss(4)
     expected = sum(
-        weight / 2 * np.sum(cubics.step * cubics.held((node + 1) / 2) ** 2)
-        for node, weight in zip(nodes, weights, strict=True)
+        weight / 2 * np.sum(p.step * held(p, (node + 1) / 2) ** 2) for node, weight in zip(nodes, weights, strict=True)
     )
     rounding = 64 * np.finfo(float).eps * np.sqrt(t.size)
     assert metrics.ise(t, f) == pytest.approx(expected, rel=rounding)
     fine = np.linspace(0.0, 1.0, 201)
-    values = cubics.held(fine[:, None])
+    values = held(p, fine[:, None])
     for weighted, metric in ((False, metrics.iae), (True, metrics.itae)):
-        size = np.abs(values) * (cubics.begin + fine[:, None] * cubics.step if weighted else 1.0)
+        size = np.abs(values) * (p.begin + fine[:, None] * p.step if weighted else 1.0)
         # The trapezoidal rule at a spacing h is exact to h^2 / 12 of the variation of the slope, and h / 2 at a jump.
         kinks = np.abs(np.diff(size, axis=0, prepend=size[:1], append=size[-1:], n=2)).sum(axis=0)
-        expected = cubics.step @ trapezoid(size, fine, axis=0)
-        assert metric(t, f) == pytest.approx(expected, rel=1e-12, abs=cubics.step @ kinks / 200)
-    between = np.abs(cubics(fine[:, None])).max()
-    bend = np.abs(cubics.c).max() + 3 * np.abs(cubics.d).max()
+        expected = p.step @ trapezoid(size, fine, axis=0)
+        assert metric(t, f) == pytest.approx(expected, rel=1e-12, abs=p.step @ kinks / 200)
+    between = np.abs(p(fine[:, None])).max()
+    bend = np.abs(p.c).max() + 3 * np.abs(p.d).max()
     assert between - 1e-14 * np.abs(f).max() <= metrics.peak(t, f) <= between + 0.5 * (0.5 / 200) ** 2 * 2 * bend
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.4, 1.0])
-def test_cubics_of_inner_intervals_are_those_of_whole_signals(spread):
-    """From the differences of several signals at all inner intervals, to the bit."""
+def test_cubics_of_some_intervals_are_those_of_whole_signals(spread):
+    """In any order, of a few intervals of several signals or of all: to the bit."""
     t = np.linspace(0.0, 3.0, 800)
     t[1:-1] += spread * t[1] * np.random.default_rng(1).uniform(-0.5, 0.5, 798)
-    f = np.array([of(t) for of in SIGNALS.values()])
-    smooth, every = Smooth(t), np.nonzero(np.ones((len(f), t.size - 3), dtype=bool))
-    near = smooth.near(f, smooth.differences(f), every, 5)
-    np.testing.assert_array_equal(near[0], 5 + every[0])
-    found, whole = smooth.pieces(near), [pieces(t, row) for row in f]
-    for field in fields(found):
-        expected = np.concatenate([getattr(p, field.name)[1:-1] for p in whole])
-        np.testing.assert_array_equal(getattr(found, field.name), expected, field.name)
+    f, rng = np.array([of(t) for of in SIGNALS.values()]), np.random.default_rng(2)
+    rows, k = np.divmod(rng.permutation(len(f) * 799), 799)
+    whole = [cubics(t, row) for row in f]
+    for some in (slice(None), *(slice(begin, begin + 300) for begin in range(0, k.size, 300))):
+        found = cubics_of_rows(Grid.of(t), f, rows[some], k[some])
+        for field in fields(found):
+            expected = np.array([getattr(p, field.name) for p in whole])[rows[some], k[some]]
+            np.testing.assert_array_equal(getattr(found, field.name), expected, field.name)
 
 
 @pytest.mark.parametrize("metric", [metrics.iae, metrics.itae, metrics.peak])
@@ -238,15 +292,13 @@ def test_extrema_by_stretches_are_those_of_all_cubics(seed):
         f[2:] += rng.choice([0.0, -7.0, 7.0], (2, 1))  # far from zero, as a torque about its bias
         edge = float(np.abs(f).max() * rng.uniform(0.01, 1.05))
         with np.errstate(divide="ignore", invalid="ignore"):
-            cubics = [pieces(t, row) for row in f]
-            values = [np.append(p(p.cuts).ravel(), row) for p, row in zip(cubics, f, strict=True)]
+            curves = [cubics(t, row) for row in f]
+            values = [np.append(p(p.cuts).ravel(), row) for p, row in zip(curves, f, strict=True)]
         np.testing.assert_allclose(metrics.peak(t, f), [np.nanmax(np.abs(v)) for v in values], rtol=1e-12)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            found = maxima(t, f)
-        np.testing.assert_allclose(found, [np.nanmax(v) for v in values], rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(maxima(t, f), [np.nanmax(v) for v in values], rtol=1e-12, atol=1e-15)
         # The distance from 0 of a signal with the target 0, which starts at 1.
         entered = metrics.settling_time(t, f, 0.0, 1.0, band=edge, start=t[0])
-        for found, p, row in zip(entered, cubics, f, strict=True):
+        for found, p, row in zip(entered, curves, f, strict=True):
             s = np.linspace(0.0, 1.0, 201)[:, None]
             dense, times = np.abs(p(s)), p.time(s)
             dense[0], dense[-1] = np.abs(p.a), np.abs(p.end)
@@ -265,6 +317,5 @@ def test_a_peak_between_samples_far_from_the_largest_sample(place, offset):
     t = np.arange(600.0)
     f = np.maximum(1.0 - 0.2 * (t - 550.0) ** 2, 1.03 - 0.2 * (t - place - 0.5) ** 2).clip(0.0) + offset
     assert f.max() == 1.0 + offset
-    with np.errstate(divide="ignore", invalid="ignore"):
-        assert maxima(t, f[None]) == pytest.approx(1.03 + offset, rel=1e-14)
+    assert maxima(t, f[None]) == pytest.approx(1.03 + offset, rel=1e-14)
     assert metrics.peak(t, f) == pytest.approx(1.03 + offset, rel=1e-14)
