@@ -41,8 +41,8 @@ def real_array(values: ArrayLike, name: str) -> Array:
     Raises
     ------
     TypeError
-        If the values are strings, truth values, complex, dates or time
-        differences, or have a physical unit, as the required unit is not known.
+        If the values are strings, complex, dates or time differences, or have
+        a physical unit, as the required unit is not known.
     ValueError
         If a value is masked or overflows, or rows differ in length.
     """
@@ -66,12 +66,18 @@ def real_array(values: ArrayLike, name: str) -> Array:
             raise ValueError(f"{name} must be within floating point, got {given!r:.80}") from None
         except (TypeError, ValueError):
             raise TypeError(f"{name} must be real numbers, got {given!r:.80}") from None
-    if array.dtype.kind == "b":
-        raise TypeError(f"{name} must be numbers, got truth values {given!r:.60}; apply a mask to the numbers first")
-    if array.dtype.kind not in "uif":
+    if array.dtype.kind not in "buif":
         kind = "complex numbers" if array.dtype.kind == "c" else f"{given!r:.80}"
         raise TypeError(f"{name} must be real numbers, got {kind}")
     return array.astype(float, copy=False)
+
+
+def array_of_numbers(values: ArrayLike, name: str) -> Array:
+    """Real numbers as an array, as by `real_array`, but no truth values."""
+    array = real_array(values, name)
+    if array is not values and np.asarray(values).dtype.kind == "b":
+        raise TypeError(f"{name} must be numbers, got truth values {values!r:.60}; apply a mask to the {name} first")
+    return array
 
 
 @lru_cache(maxsize=128)
@@ -136,7 +142,7 @@ def new_numbers(values: object, name: str) -> Array:
 
 def checked_timepts(t: ArrayLike, name: str = "times") -> Array:
     """Times as an array of any shape, without nan."""
-    times = real_array(t, name)
+    times = array_of_numbers(t, name)
     # The minimum is nan if any time is nan; argmin is much faster than min for few times.
     if times.size and math.isnan(times.item(times.argmin())):
         raise ValueError(f"{name} must not be nan, got nan at index {int(np.isnan(times).argmax())}")

@@ -123,4 +123,4 @@ def test_kinds():
 @pytest.mark.parametrize("values", [[True, False], np.array([True]), True])
 def test_truth_values_are_no_numbers(values):
     with pytest.raises(TypeError, match="values must be numbers, got truth values"):
-        _checks.real_array(values, "values")
+        _checks.array_of_numbers(values, "values")

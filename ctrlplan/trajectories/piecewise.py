@@ -10,7 +10,7 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import checked_count, checked_finite, checked_labels, real_array
+from ctrlplan._checks import array_of_numbers, checked_count, checked_finite, checked_labels
 from ctrlplan._display import number
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Data, Value
@@ -660,7 +660,7 @@ def _range(run: Run, axis: int, segments: slice | NDArray[np.intp]) -> tuple[flo
 
 def _checked_times(times: ArrayLike) -> Array:
     """Two or more finite times that increase, as a new array."""
-    moments = real_array(times, "times")
+    moments = array_of_numbers(times, "times")
     if moments.ndim != 1 or moments.size < 2 or not np.isfinite(moments).all():
         raise ValueError(f"times must be two or more finite times, got shape {moments.shape}: {times!r:.60}")
     if not (moments[1:] > moments[:-1]).all():
@@ -673,7 +673,7 @@ def _checked_times(times: ArrayLike) -> Array:
 
 def _entries_of(times: Array, values: ArrayLike, derivatives: Mapping[int, ArrayLike] | None) -> Entries:
     """Checked entries from arrays, at checked times."""
-    positions = real_array(values, "values")
+    positions = array_of_numbers(values, "values")
     by_axis = positions[None] if positions.ndim == 1 else positions
     if by_axis.ndim != 2 or by_axis.shape[1] != times.size or not len(by_axis):
         raise ValueError(
@@ -688,7 +688,7 @@ def _entries_of(times: Array, values: ArrayLike, derivatives: Mapping[int, Array
     if len(orders) < highest:
         rows[:, 1:] = np.nan
     for order, given in orders.items():
-        row = real_array(given, f"derivatives[{order}]")
+        row = array_of_numbers(given, f"derivatives[{order}]")
         if row.shape not in ((), times.shape, positions.shape):
             raise ValueError(
                 f"derivatives[{order}] must be a number or have shape {times.shape} or {positions.shape} as values, "
