@@ -635,7 +635,10 @@ def test_a_dwell_is_constant_between_segments_that_are_not(kind, alpha):
     assert abs(plan(2.6) - 5.3) > 1e-3
 
 
-@pytest.mark.parametrize("arrays", [([0, 1], [True, False]), ([0.0, 1.0], [0.0, 1.0], {1: [True, False]})])
+@pytest.mark.parametrize(
+    "arrays",
+    [{"values": [True, False]}, {"values": [0.0, 1.0], "derivatives": {1: [True, False]}}],
+)
 def test_truth_values_are_no_entries(arrays):
     with pytest.raises(TypeError, match="must be numbers, got truth values"):
-        PiecewiseSpline.from_arrays(*arrays)
+        PiecewiseSpline.from_arrays([0.0, 1.0], **arrays)
