@@ -1,7 +1,7 @@
 """Metrics of several signals at the same times, evaluated together.
 
 What takes time is the number of passes over the samples and, for few signals, the number of calls. Extrema by stretch
-exclude most samples from the search for peaks and for entries into a band, integrals are sums over samples where the
+exclude nearly all samples from the search for peaks and for entries into a band, integrals are sums over samples where the
 curvature is smooth, and the cubics of all other intervals, whichever metric needs them, are found in one call.
 """
 
@@ -23,7 +23,7 @@ TOGETHER = 2**17  # samples of a signal over the rows that are evaluated togethe
 
 
 class _Wanted:
-    """Rows and levels of extremes, in the order in which they were asked for."""
+    """Rows and levels of extremes, in the order in which they were added."""
 
     def __init__(self) -> None:
         self._parts, self._size = [(np.empty(0, dtype=np.intp), np.empty(0), np.empty(0, dtype=np.bool_))], 0
@@ -89,7 +89,7 @@ class Evaluation:
 
     @cached_property
     def _found(self) -> tuple[Array, Array, dict[tuple[Callable[..., Array], int], Array]]:
-        """Return entries and maxima in the order in which they were asked for, and integrals."""
+        """Return entries and maxima in the order in which they were added, and integrals."""
         signals = [signal for signal, _, _ in self._signals]
         f = np.ascontiguousarray(signals[0]) if len(signals) == 1 else np.concatenate(signals)
         with np.errstate(**QUIET):
