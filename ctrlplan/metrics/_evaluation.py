@@ -1,8 +1,8 @@
 """Metrics of several signals at the same times, evaluated together.
 
 What takes time is the number of passes over the samples and, for few signals, the number of calls. Extrema by stretch
-exclude nearly all samples from the search for peaks and for entries into a band, integrals are sums over samples where the
-curvature is smooth, and the cubics of all other intervals, whichever metric needs them, are found in one call.
+exclude nearly all samples from the search for peaks and for entries into a band. Integrals are sums over samples where
+the curvature is smooth, and the cubics of all other intervals, whichever metric needs them, are found in one call.
 """
 
 from collections.abc import Callable
