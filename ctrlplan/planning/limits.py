@@ -434,11 +434,13 @@ class Limited:
             return rows
         for row, b in zip(rows, self.bounds, strict=True):
             if np.isnan(row).any():
-                still = not jet[1:, :, int(np.isnan(row).argmax())].any()
+                first = int(np.isnan(row).argmax())
+                still = not jet[1:, :, first].any()
+                where = ", ".join(f"{value:.6g}" for value in jet[0, :, first].tolist())
                 raise UndeterminedError(
-                    f"{b.name} must be determined by the plan, got nan{' where the plan is at rest' if still else ''}: "
-                    "the maps of the plant are singular there, as those of a car are at rest; give a PathPlan, or "
-                    "limit another signal"
+                    f"{b.name} must be determined by the plan, got nan{' where the plan is at rest,' if still else ''} "
+                    f"at the position ({where}): the maps of the plant are singular there, as those of a car are at "
+                    "rest, or the function returns nan; give a PathPlan, or limit another signal"
                 )
         return rows
 

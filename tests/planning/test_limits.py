@@ -510,3 +510,10 @@ def test_limits_of_each_axis_may_be_values():
 def test_wrong_values(sides, error, message):
     with pytest.raises(error, match=message):
         cp.Limits(*sides)
+
+
+def test_a_function_that_returns_nan_is_named_with_the_position():
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+    said = r"u must be determined by the plan, got nan .*at the position \(1\): .*, or the function returns nan"
+    with pytest.raises(ValueError, match=said):
+        cp.fastest(plan, {"u": 1.0}, lambda jet: {"u": np.where(jet[0, 0] > 0.5, np.nan, jet[1, 0])}, hold="path")
