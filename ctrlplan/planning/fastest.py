@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from scipy.optimize import brentq
 
 from ctrlplan._checks import checked_finite, checked_pair
 from ctrlplan._display import Displayed, Facts, Figure, Part
-from ctrlplan._renamed import FormerAttribute
+from ctrlplan._renamed import FormerAttribute, outside_stacklevel
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.durations import PlansByDuration, ReplannedPlans
 from ctrlplan.planning.limits import Limited, Margin, Margins
@@ -96,8 +97,12 @@ _PLACES, _NARROW, _ZERO = 8, 1.01, 1e-10
 """Maximum number of places at which limits over time require finer cells, the factor by which a law may be slowed
 without them, and a limit that is 0, relative to the largest one."""
 
-_ABOUT_NARROW = 4.0 ** -np.arange(2.0, 15.0)
+_ABOUT_NARROW = 4.0 ** -np.arange(2.0, 10.0)
 """Distances of edges of these cells from such a place, relative to the duration."""
+
+_ROUNDED, _UNRESOLVED = 1e-6, 1.0
+"""Maximum increase of a duration by which limits are satisfied, relative to it: of rounding, and where limits over time
+change too fast for their extrema to be resolved."""
 
 _LOCAL = "not searched; a local minimum of the time law"
 
@@ -286,6 +291,12 @@ def fastest(
         motion at its ends.
     RuntimeError
         If a quantity is not resolved because it is noisy or oscillates.
+
+    Warns
+    -----
+    UserWarning
+        If the plan is slower than its time law, because limits over time change
+        within too short a part of the path.
 
     Notes
     -----
@@ -632,28 +643,43 @@ def _with_free_ends(
             f"limits must be satisfied for some duration from {span[0]:.4g} to {span[1]:.4g} s, got a minimum of "
             f"{shortest:.6g} s"
         )
-    return *_satisfying(limited, found.retime, shortest if span is None else max(shortest, span[0])), law.stops
+    most = _UNRESOLVED if slower else _ROUNDED
+    fast, margins = _satisfying(limited, found.retime, shortest if span is None else max(shortest, span[0]), most)
+    if slower and span is None and fast.duration > _NARROW * found.duration:
+        warnings.warn(
+            f"the plan is slowed by the factor {fast.duration / found.duration:.3g}, since limits over time change "
+            f"within a short part of the path, {margins.active.when}; let them change within a longer part",
+            UserWarning,
+            stacklevel=outside_stacklevel(),
+        )
+    return fast, margins, law.stops
 
 
-def _law_under_narrow_limits(plan: Trajectory, limited: Limited) -> tuple[FastLaw, float]:
+def _law_under_narrow_limits(
+    plan: Trajectory, limited: Limited, given: Rates = (None, None), reserve: float = 0.0
+) -> tuple[FastLaw, float]:
     """Fast time law and the factor by which it must be slower, with finer cells where limits over time require them."""
-    law, narrow = _law_on_path(plan, limited), list[float]()
+    law, narrow = _law_on_path(plan, limited, given, reserve), list[float]()
     bounds = [bound for bound in limited.bounds if _is_over_time(bound)]
-    while bounds:
-        worst = [(*required_rate(bound, law.plan, plan.start), bound) for bound in bounds]
-        slower, time, bound = max(worst, key=lambda own: own[0])
+    if not bounds:
+        return law, 0.0
+    for _ in range(_PLACES):
+        slower, time, bound = _slowest(plan, law, bounds)
         if slower <= _NARROW:
             return law, slower
         _check_passable(plan, bound, time)
-        about = time + plan.duration * np.concatenate([[0.0], _ABOUT_NARROW, -_ABOUT_NARROW])
-        narrow += about.tolist()
+        narrow += (time + plan.duration * np.concatenate([[0.0], _ABOUT_NARROW, -_ABOUT_NARROW])).tolist()
         try:
-            law = _law_on_path(plan, limited, narrow=narrow)
+            law = _law_on_path(plan, limited, given, reserve, narrow)
         except ValueError:  # cells too different for their linear equations
-            return law, slower
-        if len(narrow) >= _PLACES * about.size:
-            return law, max(required_rate(bound, law.plan, plan.start)[0] for bound in bounds)
-    return law, 0.0
+            break
+    return law, _slowest(plan, law, bounds)[0]
+
+
+def _slowest(plan: Trajectory, law: FastLaw, bounds: Sequence[Bound]) -> tuple[float, float, Bound]:
+    """Largest factor by which a law must be slower, the time [s] of the given plan, and the limit over time."""
+    found = [(*required_rate(bound, law.plan, plan.start), bound) for bound in bounds]
+    return max(found, key=lambda own: own[0])
 
 
 def _check_passable(plan: Trajectory, bound: Bound, time: float) -> None:
@@ -676,7 +702,7 @@ def _with_given_ends(
     stops: list[tuple[float, ...]] = []
 
     def law(reserve: float) -> Trajectory:
-        found = _law_on_path(plan, limited, (1.0, 1.0), reserve)
+        found, _ = _law_under_narrow_limits(plan, limited, (1.0, 1.0), reserve)
         stops.append(found.stops)
         return found.plan.shift(-plan.start)
 
@@ -1159,11 +1185,11 @@ def _feasible_edge(
 
 
 def _satisfying(
-    limited: Limited, plan_of: Callable[[float], Trajectory], duration: float
+    limited: Limited, plan_of: Callable[[float], Trajectory], duration: float, most: float = _ROUNDED
 ) -> tuple[Trajectory, Margins]:
     """Plan of a duration, which is increased by roundings until the limits are satisfied, and its margins."""
     step = float(np.spacing(duration))
-    while step < 1e-6 * duration:
+    while step < most * duration:
         plan = plan_of(duration)
         try:
             margins = limited.margins(plan)

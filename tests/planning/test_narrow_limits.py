@@ -68,3 +68,41 @@ def test_two_narrow_limits():
 def test_a_limit_of_0_is_never_passed(limits, time):
     with pytest.raises(ValueError, match=rf"y_d1 must not be 0 where the path moves, .* at {time} s of the given plan"):
         cp.fastest(MOVE, {"y_d1": cp.Limits(low=-1.0, **limits), "y_d2": ACCELERATION}, hold="path")
+
+
+@pytest.mark.parametrize("width", [1e-3, 1e-4])
+def test_with_limits_of_the_jerk_and_given_speeds(width):
+    """The dip costs no time but its own: next to it the plan is as fast as with a limit of 0.05 at one place."""
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0.5, 0), cp.Waypoint(1, 1, 0.5, 0)])
+
+    def dip(t):
+        return 1.0 - 0.95 * np.exp(-(((t - 0.4123) / width) ** 2))
+
+    limits = {"y_d1": cp.Limits(low=-1.0, high=dip), "y_d2": ACCELERATION}
+    given = cp.fastest(plan, limits, hold="path", ends="given")
+    free = cp.fastest(plan, limits, hold="path")
+    smooth = cp.fastest(plan, limits | {"y_d3": 1e3}, hold="path")
+    assert all(found.margins.satisfied for found in (given, free, smooth))
+    # From 0.05 to 1 the velocity takes 0.19 s and 0.1 m; it is 1 elsewhere, but for the given 0.5 at the ends.
+    place = float(plan(0.4123))
+    shortest = place + (1.0 - place) + 2 * (0.19 - (1.0 - 0.05**2) / (2 * ACCELERATION))
+    assert shortest * 0.999 <= free.duration <= smooth.duration <= 1.03 * shortest
+    assert shortest <= given.duration <= 1.1 * shortest
+
+
+def test_limits_that_cannot_be_resolved_are_satisfied_with_a_warning():
+    with pytest.warns(
+        UserWarning, match=r"the plan is slowed by the factor .* limits over time change within a short part"
+    ):
+        found = fastest(lambda t: 1e-7 + np.sqrt(np.abs(t - 0.3)))
+    assert found.margins.satisfied
+
+
+@pytest.mark.parametrize("least", [1e-2, 1e-3])
+def test_a_limit_like_a_square_root_is_satisfied(least):
+    def limit(t):
+        return least + np.sqrt(np.abs(t - 0.3))
+
+    found = fastest(limit)
+    assert found.margins.satisfied
+    assert optimum(limit, 0.3) * (1.0 - 1e-5) <= found.duration <= 1.01 * optimum(limit, 0.3)
