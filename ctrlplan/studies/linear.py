@@ -152,7 +152,7 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
 
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
     gains = np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 2)), list(NUMBERED["step"]))
-    found = swept(np.union1d(gains, _beside_jumps(gains, [built(gain) for gain in gains.tolist()], finest)))
+    found = swept(np.union1d(gains, _around_jumps(gains, [built(gain) for gain in gains.tolist()], finest)))
     while True:
         settling = [rows["settling_time"] for rows in found.metrics.values()]
         jump, steep = (np.any([settling_jumps(found.values, r, s) for r in settling], axis=0) for s in (3.0, 1.5))
@@ -175,7 +175,7 @@ def _divided(gains: Array, parts: NDArray[np.intp]) -> Array:
     return np.append(gains[left] * (gains[left + 1] / gains[left]) ** part, gains[-1])
 
 
-def _beside_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -> Array:
+def _around_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -> Array:
     """Gains on both sides of the jumps of settling times after the move, on a subdivision of given gains and loops.
 
     They enclose a jump to `finest`. One more gain is up to 24 times as far on the side
@@ -183,7 +183,7 @@ def _beside_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -
     """
     parts = _parts(gains, finest)
     fine, ends = _divided(gains, parts), np.cumsum(parts)
-    beside = []
+    around = []
     for plan in linear_plans().values():
         after = CubicSpline(np.sqrt(gains), _after_move(loops, plan))(np.sqrt(fine))  # analytic functions of the gain
         change = np.diff(np.floor(_last_extremum_outside(*after.T)))
@@ -191,8 +191,8 @@ def _beside_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -
         where = np.searchsorted(ends, jump, side="right")
         first, last = ends[where] - parts[where], ends[where]
         far = np.clip(np.where(change[jump] > 0.0, jump + 24, jump - 23), first, last)
-        beside += [fine[jump], fine[jump + 1], fine[far]]
-    return np.concatenate(beside)
+        around += [fine[jump], fine[jump + 1], fine[far]]
+    return np.concatenate(around)
 
 
 def _after_move(loops: Sequence[ct.StateSpace], plan: Trajectory) -> Array:

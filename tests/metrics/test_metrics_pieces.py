@@ -185,7 +185,7 @@ def test_metrics_that_are_evaluated_together_are_those_alone(count):
 
 
 def test_sample_times_of_one_length_are_not_confused():
-    """In one thread, and in several at once that use more times than are kept; an array whose values change."""
+    """In one thread, and in several together that use more times than are kept; an array whose values change."""
     f = np.sin(np.linspace(0.0, 3.0, 700))
     scales = [1.0 + k / 8 for k in range(12)]
     expected = [metrics.iae(np.linspace(0.0, 1.0, 700), f) * scale for scale in scales]

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan.studies import PAPER, Study, linear_study
-from ctrlplan.studies.linear import _beside_jumps, _shares, overshoot_peak
+from ctrlplan.studies.linear import _around_jumps, _shares, overshoot_peak
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 TIMES = np.linspace(0.0, 20.0, 8001)
@@ -124,12 +124,12 @@ def test_jumps_are_located_as_finely_as_stated(study):
 def test_jumps_of_the_step_are_enclosed_before_the_sweep():
     # The j-th extremum exp(-j pi/(2 w_p)) is at the edge of the band at w_p = j pi/(2 ln 50).
     even = np.linspace(0.5, 1000.0**0.5, 241) ** 2
-    beside = np.union1d(even, _beside_jumps(even, [cp.plants.integrator_lag_loop(gain) for gain in even], 1e-3))
+    around = np.union1d(even, _around_jumps(even, [cp.plants.integrator_lag_loop(gain) for gain in even], 1e-3))
     edges = 0.25 + (np.arange(1, 79) * np.pi / (2 * np.log(50.0))) ** 2
     assert edges[-1] < 1000.0 < 0.25 + (79 * np.pi / (2 * np.log(50.0))) ** 2
-    after = np.searchsorted(beside, edges)
-    np.testing.assert_array_less(beside[after] / beside[after - 1], 1.0 + 1.001e-3)
-    assert beside.size < 600
+    after = np.searchsorted(around, edges)
+    np.testing.assert_array_less(around[after] / around[after - 1], 1.0 + 1.001e-3)
+    assert around.size < 600
 
 
 def test_gains_are_spent_on_jumps_only(study):
