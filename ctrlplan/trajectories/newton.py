@@ -159,20 +159,16 @@ class NewtonSystem(Fields):
         moments = times.tolist()
         ordered, meet = _leja(effective(alpha), moments, given, meet)
         pattern = (_stored_pattern if count <= _STORED else _pattern)(ordered, given, meet)
-        nodes = times.take(pattern.waypoints)
-        beyond = times[:, None] - nodes if apart is None else apart.take(pattern.waypoints, axis=1)
-        if size is None:
-            size = count
-        fold = 0.0 if gamma is None else _fold(alpha, size, pattern.mean(moments), gamma)
-        pairs = pattern.pairs
-        if size > count:
-            spare = _spare_nodes(pattern.mean(moments), size - count)
+        nodes, pairs, whole = times.take(pattern.waypoints), pattern.pairs, size or count
+        fold = 0.0 if gamma is None else _fold(alpha, whole, pattern.mean(moments), gamma)
+        if whole > count:
+            spare = _spare_nodes(pattern.mean(moments), whole - count)
             moments = [*moments, *spare.tolist()]
             pairs = _pairs([*pattern.at, *range(len(times), len(moments))])
-            nodes, beyond = np.concatenate([nodes, spare]), np.hstack([beyond, times[:, None] - spare])
+            nodes = np.concatenate([nodes, spare])
         self._fill(
             alpha=alpha,
-            size=size,
+            size=whole,
             pattern=pattern,
             _gamma=gamma,
             _fold=fold,
@@ -180,16 +176,19 @@ class NewtonSystem(Fields):
             _moments=moments,
             _pairs=pairs,
         )
-        if pattern.places is None or apart is not None or size > count or fold:
+        spread = None
+        if pattern.places is None or apart is not None or whole > count or fold:
+            beyond = times[:, None] - nodes
+            if apart is not None:
+                beyond[:, :count] = apart.take(pattern.waypoints, axis=1)
             collocation = self._collocation(beyond)
         else:
-            collocation = _products_at_nodes(beyond, 0.5 * effective(alpha), pattern, pattern.places)
-        spread = None
-        if not pattern.hermite or size > count:
-            roughness = self.squared_samples(smooth) if size > count else None
+            collocation = _products_at_nodes(times, 0.5 * effective(alpha), pattern, pattern.places)
+        if not pattern.hermite or whole > count:
+            roughness = self.squared_samples(smooth) if whole > count else None
             collocation, spread = _factor(collocation, pattern.hermite, roughness, pattern.lead)
         self._fill(_triangle=readonly(np.asfortranarray(collocation)), _spread=spread)
-        if np.count_nonzero(self._triangle.diagonal()) < count:
+        if not all(self._triangle.diagonal().tolist()):
             raise ValueError("the constraints must determine the plan, got a singular system")
 
     @property
@@ -615,13 +614,17 @@ class NewtonSystem(Fields):
     def _is_mild(self) -> bool:
         """Whether the amplification is below `_SUSPECT`.
 
-        As no entry of the scaled triangle is above 1, no row of the product of absolute
-        values is above the sum of a row of the inverse, which the root of its squares
-        bounds. Nothing more is needed for nearly all systems.
+        With columns scaled by any weights, no entry of the product of absolute values is
+        above the largest entry times the sum of a row of the inverse, which the root of
+        its squares bounds. Nothing more is needed for nearly all systems.
         """
-        inverse, _ = lapack.dtrtri(self._triangle, 1)
-        inverse *= np.maximum.reduce(np.abs(self._triangle.T), 1)[:, None]
-        return len(inverse) ** 0.5 * lapack.dlange("F", inverse) < _SUSPECT or self.amplification < _SUSPECT
+        weights = None if self._spread is not None else self.pattern.weights
+        if weights is not None:
+            scaled = self._triangle * weights
+            inverse, _ = lapack.dtrtri(scaled, 1)
+            if len(weights) ** 0.5 * lapack.dlange("M", scaled) * lapack.dlange("F", inverse) < _SUSPECT:
+                return True
+        return self.amplification < _SUSPECT
 
     @property
     def _scaled(self) -> tuple[Array, Array]:
@@ -644,7 +647,7 @@ class NewtonSystem(Fields):
         return (FACTORIALS[order] * np.sqrt(weights) * self.taylor(nodes, order)[:, order]).T
 
 
-def _products_at_nodes(beyond: Array, half: float, pattern: Pattern, places: NDArray[np.intp]) -> Array:
+def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDArray[np.intp]) -> Array:
     r"""Collocation by elementary symmetric sums: each product without its factors that are 0.
 
     With the ratios q'/q of its other factors, a product of N factors, z of them 0, is
@@ -660,8 +663,8 @@ def _products_at_nodes(beyond: Array, half: float, pattern: Pattern, places: NDA
 
     Parameters
     ----------
-    beyond : ndarray, shape (nwaypoints, nconstraints)
-        Distances of the waypoints to the nodes.
+    times : ndarray, shape (nwaypoints,)
+        Relative times.
     half : float
         Half of alpha [rad].
     pattern : Pattern
@@ -669,31 +672,36 @@ def _products_at_nodes(beyond: Array, half: float, pattern: Pattern, places: NDA
     places : ndarray
         As of the pattern.
     """
-    order = pattern.order
-    sums = np.zeros((max(order, 1) + 1, *beyond.shape))  # V e_k
-    value = sums[0]
-    value[:, 0] = 1.0
+    order, own, count = pattern.order, pattern.own, len(times)
+    angle = np.zeros((count + 1, count))  # the last row for functions without a cosine
+    np.subtract(times, times[:, None], out=angle[:-1])
+    table = np.empty((4, count + 1, count))
+    factors, ratio, cosine, sine = table
     if half:
-        angle = beyond * (half * pattern.halves)  # of all sines, and of the cosines
-        sine, cosine = np.sin(angle), np.cos(angle)
-        factors = sine[0] / half
-        factors += pattern.own
-        ratio = pattern.apart * cosine[0]
-        ratio /= factors
+        angle *= half
+        np.divide(np.sin(angle, out=sine), half, out=factors)
+        np.subtract(np.cos(angle, out=cosine), own, out=ratio)
+        sine *= half
+        factors += own
     else:
-        factors = beyond + pattern.own
-        ratio = pattern.apart / factors
-    factors, ratio = factors[:, :-1], ratio[:, :-1]
-    np.multiply.accumulate(factors, axis=1, out=value[:, 1:])
-    terms = ratio
+        np.add(angle, own, out=factors)
+        np.subtract(1.0, own, out=ratio)
+    ratio /= factors
+    factors, ratio, *turn = table.reshape(-1, count).take(pattern.picks[: 4 if half else 2], axis=0)
+    sums = np.zeros((max(order, 1) + 1, *ratio.shape))  # V e_k
+    value = sums[0]
+    value[0] = 1.0
+    np.multiply.accumulate(factors[:-1], axis=0, out=value[1:])
+    terms = ratio[:-1]
     for k in range(1, order + 1):
-        np.add.accumulate(terms, axis=1, out=sums[k, :, 1:])
+        np.add.accumulate(terms, axis=0, out=sums[k, 1:])
         if k < order:
-            terms = ratio * sums[k, :, :-1]
+            terms = ratio[:-1] * sums[k, :-1]
     sums[1:] *= value
     if half:
-        turned = half * sine[1] * sums[:-1]
-        sums *= cosine[1]
+        cosine, sine = turn
+        turned = sine * sums[:-1]
+        sums *= cosine
         sums[1:] -= turned
         if order > 1:
             sums[2:] -= (half * half) * pattern.cosines * sums[:-2]
@@ -897,31 +905,30 @@ class Pattern:
 
     @cached_property
     def own(self) -> Array:
-        """1 for a node at the waypoint itself, else 0, (nwaypoints, nconstraints)."""
-        return readonly((np.arange(self.nwaypoints)[:, None] == self.waypoints).astype(float))
+        """1 for a node (rows) at the waypoint itself, else 0, with a last row of 1, (nwaypoints + 1, nwaypoints)."""
+        return readonly(np.vstack([np.eye(self.nwaypoints), np.ones(self.nwaypoints)]))
 
     @cached_property
-    def apart(self) -> Array:
-        """0 for a node at the waypoint itself, else 1."""
-        return readonly(1.0 - self.own)
-
-    @cached_property
-    def halves(self) -> Array:
-        """1 for the sine of each node, and for the cosine of every second one, (2, 1, nconstraints)."""
-        number = np.arange(len(self.at))
-        return readonly(np.array([[number >= 0], [number % 2 == 1]], dtype=float))
+    def picks(self) -> NDArray[np.intp]:
+        """Rows of the factors, ratios, cosines and sines of `_products_at_nodes` by function, (4, nconstraints)."""
+        rows = self.nwaypoints + 1
+        turned = np.where(np.arange(len(self.at)) % 2 == 1, self.waypoints, self.nwaypoints)
+        found = np.array([self.waypoints, rows + self.waypoints, 2 * rows + turned, 3 * rows + turned])
+        found.flags.writeable = False
+        return found
 
     @cached_property
     def zeros(self) -> NDArray[np.intp]:
-        """Number of sines of each function that are 0 at a waypoint, (nwaypoints, nconstraints)."""
-        found = np.zeros(self.own.shape, dtype=np.intp)
-        np.cumsum(self.own[:, :-1], axis=1, out=found[:, 1:], dtype=np.intp)
+        """Number of sines of each function that are 0 at a waypoint, (nconstraints, nwaypoints)."""
+        own = self.waypoints[:, None] == np.arange(self.nwaypoints)
+        found = np.zeros(own.shape, dtype=np.intp)
+        np.cumsum(own[:-1], axis=0, out=found[1:], dtype=np.intp)
         found.flags.writeable = False
         return found
 
     @cached_property
     def places(self) -> NDArray[np.intp] | None:
-        """Place in the sums of `_products_at_nodes` of each function, by constraint.
+        """Place in the sums of `_products_at_nodes` of each function (rows), by constraint (columns).
 
         Coefficients below the number of factors that are 0 are 0, as the first sum of
         order 1 is. None for many constraints or high orders.
@@ -929,18 +936,26 @@ class Pattern:
         count = len(self.at)
         if count > _STORED or self.order > _ELEMENTARY:
             return None
-        left = self.orders - self.zeros[self.waypoints].T
-        found = (left * self.nwaypoints + self.waypoints) * count + np.arange(count)[:, None]
+        left = self.orders - self.zeros[:, self.waypoints]
+        found = (left * count + np.arange(count)[:, None]) * self.nwaypoints + self.waypoints
         found = np.where(left >= 0, found, self.nwaypoints * count)
         found.flags.writeable = False
         return found
 
     @cached_property
     def cosines(self) -> Array:
-        """Reduction of sums 2 and 3 by powers of cosines, (order - 1, nwaypoints, nconstraints)."""
+        """Reduction of sums 2 and 3 by powers of cosines, (order - 1, nconstraints, nwaypoints)."""
         number, orders = np.arange(float(len(self.at))), np.arange(self.order - 1)[:, None, None]
-        factors = number + number % 2.0  # of each function
+        factors = (number + number % 2.0)[:, None]  # of each function
         return readonly((3.0 * factors - 2.0 * (orders + self.zeros)) / 6.0)
+
+    @cached_property
+    def weights(self) -> Array | None:
+        """Reciprocals of the largest entries of the functions for even times and alpha = 0; None without `places`."""
+        if self.places is None:
+            return None
+        even = _products_at_nodes(_grid(self.nwaypoints), 0.0, self, self.places)
+        return readonly(1.0 / np.abs(even).max(axis=0))
 
 
 def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> Pattern:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from operator import lt
 from typing import Any, ClassVar, Self
 
 from ctrlplan._checks import check_kind
@@ -217,6 +218,10 @@ def checked_waypoints(waypoints: Iterable[Waypoint], minimum: int = 2) -> tuple[
 
 def increasing(points: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
     """Waypoints, checked for equal axes and increasing times."""
+    if all([isinstance(point, Waypoint) for point in points]):
+        times, axes = [point.time for point in points], {(point.naxes, point.labels) for point in points}
+        if len(axes) == 1 and all(map(lt, times, times[1:])):
+            return points
     before: Waypoint | None = None
     for i, point in enumerate(points):
         if not isinstance(point, Waypoint):
