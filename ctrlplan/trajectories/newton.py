@@ -138,7 +138,6 @@ class NewtonSystem(Fields):
     _triangle: Array
     _spread: Array | None
     _fold: float
-    _nodes: Array
     _moments: list[float]  # nodes, each waypoint once
     _pairs: _Pairs
 
@@ -159,26 +158,24 @@ class NewtonSystem(Fields):
         moments = times.tolist()
         ordered, meet = _leja(effective(alpha), moments, given, meet)
         pattern = (_stored_pattern if count <= _STORED else _pattern)(ordered, given, meet)
-        nodes, pairs, whole = times.take(pattern.waypoints), pattern.pairs, size or count
+        pairs, whole = pattern.pairs, size or count
         fold = 0.0 if gamma is None else _fold(alpha, whole, pattern.mean(moments), gamma)
         if whole > count:
             spare = _spare_nodes(pattern.mean(moments), whole - count)
             moments = [*moments, *spare.tolist()]
             pairs = _pairs([*pattern.at, *range(len(times), len(moments))])
-            nodes = np.concatenate([nodes, spare])
         self._fill(
             alpha=alpha,
             size=whole,
             pattern=pattern,
             _gamma=gamma,
             _fold=fold,
-            _nodes=readonly(nodes),
             _moments=moments,
             _pairs=pairs,
         )
         spread = None
         if pattern.places is None or apart is not None or whole > count or fold:
-            beyond = times[:, None] - nodes
+            beyond = times[:, None] - self._nodes
             if apart is not None:
                 beyond[:, :count] = apart.take(pattern.waypoints, axis=1)
             collocation = self._collocation(beyond)
@@ -188,7 +185,7 @@ class NewtonSystem(Fields):
             roughness = self.squared_samples(smooth) if whole > count else None
             collocation, spread = _factor(collocation, pattern.hermite, roughness, pattern.lead)
         self._fill(_triangle=readonly(np.asfortranarray(collocation)), _spread=spread)
-        if not all(self._triangle.diagonal().tolist()):
+        if not all(collocation.diagonal().tolist()):
             raise ValueError("the constraints must determine the plan, got a singular system")
 
     @property
@@ -242,7 +239,8 @@ class NewtonSystem(Fields):
             offset = offset * pattern.positions[pattern.anchor]
             return offset, taylor_data - pattern.positions * offset
         data = taylor_data.copy()
-        data[: pattern.leading] -= offset
+        positions = data[: pattern.leading]
+        positions -= offset
         return offset, data
 
     def coefficients_of_many(self, taylor_data: NDArray[Any]) -> Array:
@@ -324,6 +322,12 @@ class NewtonSystem(Fields):
         """
         first, second = self._paired
         return self._taylor(u - first[:, None], u - second[:, None], order)
+
+    @cached_property
+    def _nodes(self) -> Array:
+        """Nodes of the products."""
+        moments, pattern = self._moments, self.pattern
+        return readonly(np.array([*[moments[i] for i in pattern.at], *moments[pattern.nwaypoints :]]))
 
     @cached_property
     def _paired(self) -> tuple[Array, Array]:
@@ -616,13 +620,16 @@ class NewtonSystem(Fields):
 
         With columns scaled by any weights, no entry of the product of absolute values is
         above the largest entry times the sum of a row of the inverse, which the root of
-        its squares bounds. Nothing more is needed for nearly all systems.
+        its squares bounds. For few waypoints that are not close together nothing more is
+        needed.
         """
-        weights = None if self._spread is not None else self.pattern.weights
+        weights = None if self._spread is not None else _weights(self.pattern, round(self.alpha))
         if weights is not None:
             scaled = self._triangle * weights
             inverse, _ = lapack.dtrtri(scaled, 1)
-            if len(weights) ** 0.5 * lapack.dlange("M", scaled) * lapack.dlange("F", inverse) < _SUSPECT:
+            scaled, inverse = scaled.ravel(order="K"), inverse.ravel(order="K")
+            largest = abs(scaled[blas.idamax(scaled)])
+            if len(weights) ** 0.5 * largest * blas.dnrm2(inverse) < _SUSPECT:
                 return True
         return self.amplification < _SUSPECT
 
@@ -949,13 +956,17 @@ class Pattern:
         factors = (number + number % 2.0)[:, None]  # of each function
         return readonly((3.0 * factors - 2.0 * (orders + self.zeros)) / 6.0)
 
-    @cached_property
-    def weights(self) -> Array | None:
-        """Reciprocals of the largest entries of the functions for even times and alpha = 0; None without `places`."""
-        if self.places is None:
-            return None
-        even = _products_at_nodes(_grid(self.nwaypoints), 0.0, self, self.places)
-        return readonly(1.0 / np.abs(even).max(axis=0))
+
+@lru_cache(maxsize=256)
+def _weights(pattern: Pattern, alpha: float) -> Array | None:
+    """Reciprocals of the largest entry of each column of the triangle for even times, as a matrix.
+
+    None for many constraints or high orders.
+    """
+    if pattern.places is None:
+        return None
+    even = np.abs(_products_at_nodes(_grid(pattern.nwaypoints), 0.5 * alpha, pattern, pattern.places))
+    return readonly(np.asfortranarray(np.broadcast_to(1.0 / even.max(axis=0), even.shape)))
 
 
 def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> Pattern:
