@@ -219,7 +219,7 @@ class NewtonSystem(Fields):
 
     def taylor_scale(self, duration: float) -> Array:
         """Factors from prescribed derivatives to normalised Taylor data, as a column."""
-        return _taylor_scale(duration, self.pattern.keys)
+        return _taylor_scale(duration, self.pattern)
 
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
@@ -748,18 +748,19 @@ def shared_system(
 
 
 @lru_cache(maxsize=256)
-def _taylor_scale(duration: float, orders: tuple[int, ...]) -> Array:
-    """Powers of a duration over factorials, as a column."""
+def _taylor_scale(duration: float, pattern: Pattern) -> Array:
+    """Powers of a duration over factorials by constraint, as a column."""
+    order = pattern.order
     try:
-        powers = [duration**k / math.factorial(k) for k in range(max(orders) + 1)]
+        powers = [duration**k / math.factorial(k) for k in range(order + 1)]
     except OverflowError:
         powers = [0.0]
     if not 1e-290 < powers[-1] < math.inf:
         raise ValueError(
             f"powers of the duration must stay within floating point, got {duration:g} s to the power "
-            f"{max(orders)}; choose another unit of time"
+            f"{order}; choose another unit of time"
         )
-    return readonly(np.array([[powers[k]] for k in orders]))
+    return readonly(np.array(powers).take(pattern.orders)[:, None])
 
 
 def _ranges(alpha: float, nodes: list[float], peaks: list[tuple[float, float]]) -> list[float]:
@@ -996,8 +997,8 @@ def _leja(
     coincide come first: as their data agree, the divided differences between them
     are 0 or small, and no others are divided by their distance.
     """
-    used = [i for i, own in enumerate(given) if own]
-    u = times if len(used) == len(times) else [times[i] for i in used]
+    used = None if all(given) else [i for i, own in enumerate(given) if own]
+    u = times if used is None else [times[i] for i in used]
     half, last, sin = 0.5 * alpha, len(u) - 1, math.sin
     product = [abs(sin(half * (w - u[0]))) for w in u] if half else [w - u[0] for w in u]
     if meet:
@@ -1016,7 +1017,7 @@ def _leja(
                 product = [p * (abs(w - v) / scale) for p, w in zip(product, u, strict=True)]
     if last:
         chosen.append(last * (last + 1) // 2 - sum(chosen))  # the only one that is left
-    return tuple([used[i] for i in chosen]), meet
+    return tuple(chosen if used is None else [used[i] for i in chosen]), meet
 
 
 def _sequence(waypoints: tuple[int, ...], given: tuple[tuple[int, ...], ...]) -> list[tuple[int, int]]:

@@ -219,8 +219,9 @@ def checked_waypoints(waypoints: Iterable[Waypoint], minimum: int = 2) -> tuple[
 def increasing(points: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
     """Waypoints, checked for equal axes and increasing times."""
     if all([isinstance(point, Waypoint) for point in points]):
-        times, axes = [point.time for point in points], {(point.naxes, point.labels) for point in points}
-        if len(axes) == 1 and all(map(lt, times, times[1:])):
+        naxes, labels, times = points[0].naxes, points[0].labels, [point.time for point in points]
+        same = all([point.naxes == naxes and point.labels == labels for point in points])
+        if same and all(map(lt, times, times[1:])):
             return points
     before: Waypoint | None = None
     for i, point in enumerate(points):
