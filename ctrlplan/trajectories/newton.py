@@ -577,13 +577,11 @@ class NewtonSystem(Fields):
         """Root of the sum of the squares of the same."""
         return math.sqrt(sum([value * value for value in self.ranges[1:]])) * (1.0 + 1e-12)
 
-    @cached_property
-    def _swings(self) -> list[float]:
-        """Ranges of all functions; of two waypoints without the range that their positions allow to the second."""
-        ranges = [0.0, *self.ranges]
-        if self.pattern.is_short == 2:
-            ranges[1] -= MAXIMUM_SWING * abs(self._triangle.item(1, 1))
-        return ranges
+    @property
+    def coarse_ranges(self) -> Array:
+        """Bounds of the ranges of all functions from the order of the nodes alone, 0 for the first function."""
+        closed = self._moments[self.pattern.nwaypoints - 1] == 1.0
+        return _coarse_ranges(self.pattern, self.size, closed, self.alpha > math.pi)
 
     def stays_near(self, coefficients: Array, values: Array) -> bool:
         """Whether coefficients are finite and exclude a swing far beyond the positions.
@@ -601,12 +599,19 @@ class NewtonSystem(Fields):
         count = self.pattern.is_short
         if not count or self._fold:
             return False
-        ranges, columns = self._swings, coefficients.T.tolist()
         if count == 2:  # the second coefficient is the difference of the positions
+            ranges, columns = self._added_ranges, coefficients.T.tolist()
             return all([-math.inf < sum(map(mul, ranges, map(abs, column))) <= 0.0 for column in columns])
+        bounds = self.coarse_ranges.dot(np.abs(coefficients)).tolist()
         allowed = [MAXIMUM_SWING * (max(row) - min(row)) for row in values[:count].T.tolist()]
-        rows = zip(columns, allowed, strict=True)
-        return all([sum(map(mul, ranges, map(abs, column))) <= limit < math.inf for column, limit in rows])
+        return all([bound <= limit < math.inf for bound, limit in zip(bounds, allowed, strict=True)])
+
+    @cached_property
+    def _added_ranges(self) -> list[float]:
+        """Ranges of the functions of two waypoints, without the range that their positions allow to the second."""
+        ranges = [0.0, *self.ranges]
+        ranges[1] -= MAXIMUM_SWING * abs(self._triangle.item(1, 1))
+        return ranges
 
     @cached_property
     def amplification(self) -> float:
@@ -761,6 +766,30 @@ def _taylor_scale(duration: float, pattern: Pattern) -> Array:
             f"{order}; choose another unit of time"
         )
     return readonly(np.array(powers).take(pattern.orders)[:, None])
+
+
+@lru_cache(maxsize=256)
+def _coarse_ranges(pattern: Pattern, size: int, closed: bool, turns: bool) -> Array:
+    r"""Bounds of the ranges of functions for any times of waypoints, the last one at the end if `closed`.
+
+    A factor is at most the distance to its node. Of a nodes at the start and b at the
+    end the product is at most
+
+    .. math:: \max_u u^a (1 - u)^b = a^a b^b / (a + b)^{a + b}
+
+    and does not change its sign. Of the other factors, squares are at most 1, and so
+    are the ranges, with 0, of one other and of a product of two. A cosine is at most 1,
+    and changes its sign only if `turns`, for alpha above pi.
+    """
+    spare = range(pattern.nwaypoints, pattern.nwaypoints + size - len(pattern.at))
+    found, first, last = [0.0], 0, pattern.nwaypoints - 1 if closed else -1
+    counts = dict.fromkeys((first, last, *pattern.at, *spare), 0)
+    for number, node in enumerate((*pattern.at, *spare)[: size - 1], 1):
+        counts[node] += 1
+        a, b = counts[first], counts[last]
+        odd = sum([count % 2 for other, count in counts.items() if other not in (first, last)])
+        found.append(a**a * b**b / (a + b) ** (a + b) * (2.0 if odd > 2 or (turns and number % 2) else 1.0))
+    return readonly(np.array(found))
 
 
 def _ranges(alpha: float, nodes: list[float], peaks: list[tuple[float, float]]) -> list[float]:

@@ -145,10 +145,7 @@ class NewtonSpline(WaypointSpline):
             data = system.entries(table)
             if len(axes) < table.shape[2]:
                 data = data[:, axes]
-            found = _fitted(system, data, times, duration)
-            near = near and system.stays_near(found, data)
-            if not near:
-                _check_finite(found, data, duration)
+            found, near = _fitted(system, data, times, duration, near)
             parts.append((axes, system, found))
         if donor is not None and len(donor.labels) == table.shape[2]:
             labels = donor.labels
@@ -355,18 +352,22 @@ def _system(
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _fitted(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:
-    """Coefficients from prescribed derivatives (nconstraints, naxes), which may overflow."""
-    return system.fitted(data, times, duration, data * system.taylor_scale(duration))
+def _fitted(system: NewtonSystem, data: Array, times: list[float], duration: float, check: bool) -> tuple[Array, bool]:
+    """Coefficients from prescribed derivatives (nconstraints, naxes), and whether a check excludes a swing.
 
-
-def _check_finite(found: Array, data: Array, duration: float) -> None:
-    """Raise for coefficients that are not finite."""
-    if not (are_finite(found.T) or np.isfinite(found).all()):
+    Raises
+    ------
+    ValueError
+        If a coefficient overflows, or is too inaccurate.
+    """
+    found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
+    near = check and system.stays_near(found, data)
+    if not near and not (are_finite(found.T) or np.isfinite(found).all()):
         raise ValueError(
             "coefficients must stay within floating point, got an overflow from "
             f"waypoint entries of up to {np.abs(data).max():g} over {duration:g} s"
         )
+    return found, near
 
 
 def _apart(times: list[float], relative: tuple[float, ...], duration: float) -> Array | None:

@@ -151,6 +151,9 @@ def test_ranges_of_functions_are_bounded(alpha):
         values = system.taylor(np.linspace(0.0, 1.0, 2001), 0)[:, 0]
         ranges = np.ptp(values[1:], axis=1)
         assert (ranges <= np.array(system.ranges) * (1.0 + 1e-12)).all()
+        assert (ranges <= system.coarse_ranges[1:] * (1.0 + 1e-12)).all()
+        if not inner.size and not alpha and len(set(given)) == 1:
+            np.testing.assert_allclose(ranges, system.coarse_ranges[1:], rtol=1e-5)
         if not inner.size and alpha <= math.pi and len(set(given)) == 1:
             np.testing.assert_allclose(ranges, system.ranges, rtol=1e-5)
         grid = system.taylor(np.linspace(0.0, 1.0, 2 * system.size + 1), 0)[:, 0]
