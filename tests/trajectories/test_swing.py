@@ -193,7 +193,7 @@ def test_the_bounds_of_piecewise_splines_let_no_swing_pass(alpha):
         )
         spans = np.ptp(rows[:, 0], axis=1)
         values = plan(np.linspace(times[0], times[-1], 300 * (n - 1) + 1)).reshape(naxes, -1)
-        excluded = plan._is_small(spans.tolist()), plan._stays_near()
+        excluded = plan._is_small(), plan._stays_near()
         if any(excluded):
             assert (np.ptp(values, axis=1) <= 3.0 * spans).all()
         decided = [count + own for count, own in zip(decided, excluded, strict=True)]
