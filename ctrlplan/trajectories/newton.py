@@ -138,6 +138,7 @@ class NewtonSystem(Fields):
     _triangle: Array
     _spread: Array | None
     _fold: float
+    _nodes: Array
     _moments: list[float]  # nodes, each waypoint once
     _pairs: _Pairs
 
@@ -158,24 +159,26 @@ class NewtonSystem(Fields):
         moments = times.tolist()
         ordered, meet = _leja(effective(alpha), moments, given, meet)
         pattern = (_stored_pattern if count <= _STORED else _pattern)(ordered, given, meet)
-        pairs, whole = pattern.pairs, size or count
+        nodes, pairs, whole = times.take(pattern.waypoints), pattern.pairs, size or count
         fold = 0.0 if gamma is None else _fold(alpha, whole, pattern.mean(moments), gamma)
         if whole > count:
             spare = _spare_nodes(pattern.mean(moments), whole - count)
             moments = [*moments, *spare.tolist()]
             pairs = _pairs([*pattern.at, *range(len(times), len(moments))])
+            nodes = np.concatenate([nodes, spare])
         self._fill(
             alpha=alpha,
             size=whole,
             pattern=pattern,
             _gamma=gamma,
             _fold=fold,
+            _nodes=readonly(nodes),
             _moments=moments,
             _pairs=pairs,
         )
         spread = None
         if pattern.places is None or apart is not None or whole > count or fold:
-            beyond = times[:, None] - self._nodes
+            beyond = times[:, None] - nodes
             if apart is not None:
                 beyond[:, :count] = apart.take(pattern.waypoints, axis=1)
             collocation = self._collocation(beyond)
@@ -322,12 +325,6 @@ class NewtonSystem(Fields):
         """
         first, second = self._paired
         return self._taylor(u - first[:, None], u - second[:, None], order)
-
-    @cached_property
-    def _nodes(self) -> Array:
-        """Nodes of the products."""
-        moments, pattern = self._moments, self.pattern
-        return readonly(np.array([*[moments[i] for i in pattern.at], *moments[pattern.nwaypoints :]]))
 
     @cached_property
     def _paired(self) -> tuple[Array, Array]:
