@@ -282,6 +282,8 @@ class NewtonSystem(Fields):
         ValueError
             If rounding could change the plan by more than 1e-6 of its range.
         """
+        if self._is_mild and self.alpha <= NEARLY_CLOSED:  # nearly all
+            return self.coefficients(taylor_data)
         loss = self.loss(taylor_data)
         if self._across(times, duration) < _ACROSS and self.hermite and len(values) <= _MAXIMUM_DIGITS:
             loss = 1.0  # the triangle itself is inaccurate

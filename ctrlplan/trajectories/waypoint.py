@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._checks import checked_finite, default_labels, new_numbers
 from ctrlplan._display import Displayed, Part, Table, counted, number, shortened
 from ctrlplan._types import Data
-from ctrlplan.trajectories.common import Array, are_finite, readonly, times_powers
+from ctrlplan.trajectories.common import Array, readonly, times_powers
 from ctrlplan.trajectories.fields import Fields
 
 ENTRIES = ("position", "velocity", "acceleration", "jerk", "snap")
@@ -84,7 +85,9 @@ class Waypoint(Displayed, Fields):
         jet = _rows(entries)
         if jet is None:
             jet = _plain(entries)
-        self._set(checked_finite(time, "time"), _jet(entries) if jet is None else jet, None)
+        if type(time) is not float or not math.isfinite(time):
+            time = checked_finite(time, "time")
+        self._set(time, _jet(entries) if jet is None else jet, None)
 
     @classmethod
     def from_jets(cls, time: float, /, **jets: Sequence[float | None]) -> Waypoint:
@@ -152,12 +155,14 @@ class Waypoint(Displayed, Fields):
         return self
 
     def _set(self, time: float, jet: Array, labels: tuple[str, ...] | None) -> None:
-        complete = are_finite(jet) or bool(np.isfinite(jet).all())
+        # The sum of a few numbers is faster than a call of numpy; it is finite only if all are.
+        complete = math.isfinite(sum(jet.ravel().tolist())) or bool(np.isfinite(jet).all())
         if not complete and np.isinf(jet).any():
             order, axis = np.argwhere(np.isinf(jet))[0]
             name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
             raise ValueError(f"{name} must be finite or nan (free), got {jet[order, axis]} at time {time:g}")
-        self._fill(time=time, jet=readonly(jet), labels=labels, complete=complete, naxes=jet.shape[1])
+        jet.setflags(write=False)
+        self._fill(time=time, jet=jet, labels=labels, complete=complete, naxes=jet.shape[1])
 
     @property
     def position(self) -> Array:
