@@ -686,37 +686,43 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
     order, own, count = pattern.order, pattern.own, len(times)
     angle = np.zeros((count + 1, count))  # the last row for functions without a cosine
     np.subtract(times, times[:, None], out=angle[:-1])
-    table = np.empty((4, count + 1, count))
-    factors, ratio, cosine, sine = table
     if half:
         angle *= half
-        np.divide(np.sin(angle, out=sine), half, out=factors)
-        np.subtract(np.cos(angle, out=cosine), own, out=ratio)
-        sine *= half
+        sine, cosine = np.sin(angle), np.cos(angle)
+        factors = sine / half
         factors += own
+        ratio = cosine - own
+        ratio /= factors
+        sine *= half
+        factors, ratio, cosine, sine = np.concatenate((factors, ratio, cosine, sine)).take(pattern.picks, axis=0)
     else:
-        np.add(angle, own, out=factors)
-        np.subtract(1.0, own, out=ratio)
-    ratio /= factors
-    factors, ratio, *turn = table.reshape(-1, count).take(pattern.picks[: 4 if half else 2], axis=0)
+        factors = angle + own
+        factors, ratio = np.concatenate((factors, (1.0 - own) / factors)).take(pattern.picks[:2], axis=0)
     sums = np.zeros((max(order, 1) + 1, *ratio.shape))  # V e_k
-    value = sums[0]
+    value, higher = sums[0], sums[1:]
     value[0] = 1.0
     np.multiply.accumulate(factors[:-1], axis=0, out=value[1:])
-    terms = ratio[:-1]
+    ratio = ratio[:-1]
+    terms = ratio
     for k in range(1, order + 1):
         np.add.accumulate(terms, axis=0, out=sums[k, 1:])
         if k < order:
-            terms = ratio[:-1] * sums[k, :-1]
-    sums[1:] *= value
+            terms = ratio * sums[k, :-1]
+    higher *= value
     if half:
-        cosine, sine = turn
         turned = sine * sums[:-1]
         sums *= cosine
-        sums[1:] -= turned
+        higher -= turned
         if order > 1:
-            sums[2:] -= (half * half) * pattern.cosines * sums[:-2]
+            highest = sums[2:]
+            highest -= _reduction(pattern, half) * sums[:-2]
     return sums.ravel().take(places).T
+
+
+@lru_cache(maxsize=256)
+def _reduction(pattern: Pattern, half: float) -> Array:
+    """Reduction of sums 2 and 3 by powers of cosines, (order - 1, nconstraints, nwaypoints)."""
+    return readonly((half * half) * pattern.cosines)
 
 
 def _next(ratio: Array, lower: Array | Sequence[Array], bend: float) -> Array:
@@ -737,7 +743,7 @@ def _identity(size: int) -> Array:
     return readonly(np.asfortranarray(np.eye(size)))
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)  # few enough to stay in the second cache of a processor
 def shared_system(
     alpha: float,
     times: tuple[float, ...],
@@ -980,7 +986,7 @@ class Pattern:
 
     @cached_property
     def cosines(self) -> Array:
-        """Reduction of sums 2 and 3 by powers of cosines, (order - 1, nconstraints, nwaypoints)."""
+        """Reduction of sums 2 and 3 by powers of cosines for alpha = 2, (order - 1, nconstraints, nwaypoints)."""
         number, orders = np.arange(float(len(self.at))), np.arange(self.order - 1)[:, None, None]
         factors = (number + number % 2.0)[:, None]  # of each function
         return readonly((3.0 * factors - 2.0 * (orders + self.zeros)) / 6.0)
