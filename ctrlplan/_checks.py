@@ -118,17 +118,24 @@ def one_number(value: object, name: str, rule: str = "a number") -> float:
     if type(value) is float:
         return value
     given: Any = value
-    wrong = TypeError(f"{name} must be {rule}, got {value!r:.80}")
-    if isinstance(value, _NO_NUMBERS) or bool(getattr(given, "ndim", False)) or np.ma.is_masked(given):
-        raise wrong
-    if getattr(getattr(given, "dtype", None), "kind", "f") not in "iufO" or _unit(given):
-        raise wrong
     try:
+        if type(value) not in _PLAIN and _is_no_number(given):
+            raise TypeError
         return float(given)
     except OverflowError:
         raise ValueError(f"{name} must be within floating point, got {value!r:.80}") from None
     except (TypeError, ValueError):
-        raise wrong from None
+        raise TypeError(f"{name} must be {rule}, got {value!r:.80}") from None
+
+
+_PLAIN = frozenset({int, np.float64})
+
+
+def _is_no_number(value: Any) -> bool:
+    """Whether a value is of a kind that `float` would convert although it is not one number without a unit."""
+    if isinstance(value, _NO_NUMBERS) or bool(getattr(value, "ndim", False)) or np.ma.is_masked(value):
+        return True
+    return getattr(getattr(value, "dtype", None), "kind", "f") not in "iufO" or bool(_unit(value))
 
 
 def new_numbers(values: object, name: str) -> Array:

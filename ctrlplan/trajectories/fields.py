@@ -41,9 +41,10 @@ class Fields(Frozen):
 
     def _fill(self, **values: Any) -> None:
         """Set fields as `_set_fields`, without its checks but that each is new; arrays must be read-only."""
-        if not values.keys().isdisjoint(self.__dict__):
+        fields = self.__dict__
+        if fields and not values.keys().isdisjoint(fields):
             self._set_fields(**values)  # raises
-        self.__dict__.update(values)
+        fields.update(values)
 
     def _with_fields(self, **values: Any) -> Self:
         """Copy with some fields changed and without cached values."""

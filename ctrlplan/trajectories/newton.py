@@ -159,20 +159,16 @@ class NewtonSystem(Fields):
         moments = times.tolist()
         ordered, meet = _leja(effective(alpha), moments, given, meet)
         pattern = (_stored_pattern if count <= _STORED else _pattern)(ordered, given, meet)
-        nodes = times.take(pattern.waypoints)
-        beyond = times[:, None] - nodes if apart is None else apart.take(pattern.waypoints, axis=1)
-        if size is None:
-            size = count
-        fold = 0.0 if gamma is None else _fold(alpha, size, pattern.mean(moments), gamma)
-        pairs = pattern.pairs
-        if size > count:
-            spare = _spare_nodes(pattern.mean(moments), size - count)
+        nodes, pairs, whole = times.take(pattern.waypoints), pattern.pairs, size or count
+        fold = 0.0 if gamma is None else _fold(alpha, whole, pattern.mean(moments), gamma)
+        if whole > count:
+            spare = _spare_nodes(pattern.mean(moments), whole - count)
             moments = [*moments, *spare.tolist()]
             pairs = _pairs([*pattern.at, *range(len(times), len(moments))])
-            nodes, beyond = np.concatenate([nodes, spare]), np.hstack([beyond, times[:, None] - spare])
+            nodes = np.concatenate([nodes, spare])
         self._fill(
             alpha=alpha,
-            size=size,
+            size=whole,
             pattern=pattern,
             _gamma=gamma,
             _fold=fold,
@@ -180,16 +176,19 @@ class NewtonSystem(Fields):
             _moments=moments,
             _pairs=pairs,
         )
-        if pattern.places is None or apart is not None or size > count or fold:
+        spread = None
+        if pattern.places is None or apart is not None or whole > count or fold:
+            beyond = times[:, None] - nodes
+            if apart is not None:
+                beyond[:, :count] = apart.take(pattern.waypoints, axis=1)
             collocation = self._collocation(beyond)
         else:
-            collocation = _products_at_nodes(beyond, 0.5 * effective(alpha), pattern, pattern.places)
-        spread = None
-        if not pattern.hermite or size > count:
-            roughness = self.squared_samples(smooth) if size > count else None
+            collocation = _products_at_nodes(times, 0.5 * effective(alpha), pattern, pattern.places)
+        if not pattern.hermite or whole > count:
+            roughness = self.squared_samples(smooth) if whole > count else None
             collocation, spread = _factor(collocation, pattern.hermite, roughness, pattern.lead)
         self._fill(_triangle=readonly(np.asfortranarray(collocation)), _spread=spread)
-        if np.count_nonzero(self._triangle.diagonal()) < count:
+        if not all(collocation.diagonal().tolist()):
             raise ValueError("the constraints must determine the plan, got a singular system")
 
     @property
@@ -223,7 +222,7 @@ class NewtonSystem(Fields):
 
     def taylor_scale(self, duration: float) -> Array:
         """Factors from prescribed derivatives to normalised Taylor data, as a column."""
-        return _taylor_scale(duration, self.pattern.keys)
+        return _taylor_scale(duration, self.pattern)
 
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
@@ -243,7 +242,8 @@ class NewtonSystem(Fields):
             offset = offset * pattern.positions[pattern.anchor]
             return offset, taylor_data - pattern.positions * offset
         data = taylor_data.copy()
-        data[: pattern.leading] -= offset
+        positions = data[: pattern.leading]
+        positions -= offset
         return offset, data
 
     def coefficients_of_many(self, taylor_data: NDArray[Any]) -> Array:
@@ -282,6 +282,8 @@ class NewtonSystem(Fields):
         ValueError
             If rounding could change the plan by more than 1e-6 of its range.
         """
+        if self._is_mild and self.alpha <= NEARLY_CLOSED:  # nearly all
+            return self.coefficients(taylor_data)
         loss = self.loss(taylor_data)
         if self._across(times, duration) < _ACROSS and self.hermite and len(values) <= _MAXIMUM_DIGITS:
             loss = 1.0  # the triangle itself is inaccurate
@@ -574,13 +576,11 @@ class NewtonSystem(Fields):
         """Root of the sum of the squares of the same."""
         return math.sqrt(sum([value * value for value in self.ranges[1:]])) * (1.0 + 1e-12)
 
-    @cached_property
-    def _swings(self) -> list[float]:
-        """Ranges of all functions; of two waypoints without the range that their positions allow to the second."""
-        ranges = [0.0, *self.ranges]
-        if self.pattern.is_short == 2:
-            ranges[1] -= MAXIMUM_SWING * abs(self._triangle.item(1, 1))
-        return ranges
+    @property
+    def coarse_ranges(self) -> Array:
+        """Bounds of the ranges of all functions from the order of the nodes alone, 0 for the first function."""
+        closed = self._moments[self.pattern.nwaypoints - 1] == 1.0
+        return _coarse_ranges(self.pattern, self.size, closed, self.alpha > math.pi)
 
     def stays_near(self, coefficients: Array, values: Array) -> bool:
         """Whether coefficients are finite and exclude a swing far beyond the positions.
@@ -598,12 +598,19 @@ class NewtonSystem(Fields):
         count = self.pattern.is_short
         if not count or self._fold:
             return False
-        ranges, columns = self._swings, coefficients.T.tolist()
         if count == 2:  # the second coefficient is the difference of the positions
+            ranges, columns = self._added_ranges, coefficients.T.tolist()
             return all([-math.inf < sum(map(mul, ranges, map(abs, column))) <= 0.0 for column in columns])
+        bounds = self.coarse_ranges.dot(np.abs(coefficients)).tolist()
         allowed = [MAXIMUM_SWING * (max(row) - min(row)) for row in values[:count].T.tolist()]
-        rows = zip(columns, allowed, strict=True)
-        return all([sum(map(mul, ranges, map(abs, column))) <= limit < math.inf for column, limit in rows])
+        return all([bound <= limit < math.inf for bound, limit in zip(bounds, allowed, strict=True)])
+
+    @cached_property
+    def _added_ranges(self) -> list[float]:
+        """Ranges of the functions of two waypoints, without the range that their positions allow to the second."""
+        ranges = [0.0, *self.ranges]
+        ranges[1] -= MAXIMUM_SWING * abs(self._triangle.item(1, 1))
+        return ranges
 
     @cached_property
     def amplification(self) -> float:
@@ -615,13 +622,20 @@ class NewtonSystem(Fields):
     def _is_mild(self) -> bool:
         """Whether the amplification is below `_SUSPECT`.
 
-        As no entry of the scaled triangle is above 1, no row of the product of absolute
-        values is above the sum of a row of the inverse, which the root of its squares
-        bounds. Nothing more is needed for nearly all systems.
+        With columns scaled by any weights, no entry of the product of absolute values is
+        above the largest entry times the sum of a row of the inverse, which the root of
+        its squares bounds. For few waypoints that are not close together nothing more is
+        needed.
         """
-        inverse, _ = lapack.dtrtri(self._triangle, 1)
-        inverse *= np.maximum.reduce(np.abs(self._triangle.T), 1)[:, None]
-        return len(inverse) ** 0.5 * lapack.dlange("F", inverse) < _SUSPECT or self.amplification < _SUSPECT
+        weights = None if self._spread is not None else _weights(self.pattern, round(self.alpha))
+        if weights is not None:
+            scaled = self._triangle * weights
+            inverse, _ = lapack.dtrtri(scaled, 1)
+            scaled, inverse = scaled.ravel(order="K"), inverse.ravel(order="K")
+            largest = abs(scaled[blas.idamax(scaled)])
+            if len(weights) ** 0.5 * largest * blas.dnrm2(inverse) < _SUSPECT:
+                return True
+        return self.amplification < _SUSPECT
 
     @property
     def _scaled(self) -> tuple[Array, Array]:
@@ -644,7 +658,7 @@ class NewtonSystem(Fields):
         return (FACTORIALS[order] * np.sqrt(weights) * self.taylor(nodes, order)[:, order]).T
 
 
-def _products_at_nodes(beyond: Array, half: float, pattern: Pattern, places: NDArray[np.intp]) -> Array:
+def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDArray[np.intp]) -> Array:
     r"""Collocation by elementary symmetric sums: each product without its factors that are 0.
 
     With the ratios q'/q of its other factors, a product of N factors, z of them 0, is
@@ -660,8 +674,8 @@ def _products_at_nodes(beyond: Array, half: float, pattern: Pattern, places: NDA
 
     Parameters
     ----------
-    beyond : ndarray, shape (nwaypoints, nconstraints)
-        Distances of the waypoints to the nodes.
+    times : ndarray, shape (nwaypoints,)
+        Relative times.
     half : float
         Half of alpha [rad].
     pattern : Pattern
@@ -669,35 +683,46 @@ def _products_at_nodes(beyond: Array, half: float, pattern: Pattern, places: NDA
     places : ndarray
         As of the pattern.
     """
-    order = pattern.order
-    sums = np.zeros((max(order, 1) + 1, *beyond.shape))  # V e_k
-    value = sums[0]
-    value[:, 0] = 1.0
+    order, own, count = pattern.order, pattern.own, len(times)
+    angle = np.zeros((count + 1, count))  # the last row for functions without a cosine
+    np.subtract(times, times[:, None], out=angle[:-1])
     if half:
-        angle = beyond * (half * pattern.halves)  # of all sines, and of the cosines
+        angle *= half
         sine, cosine = np.sin(angle), np.cos(angle)
-        factors = sine[0] / half
-        factors += pattern.own
-        ratio = pattern.apart * cosine[0]
+        factors = sine / half
+        factors += own
+        ratio = cosine - own
         ratio /= factors
+        sine *= half
+        factors, ratio, cosine, sine = np.concatenate((factors, ratio, cosine, sine)).take(pattern.picks, axis=0)
     else:
-        factors = beyond + pattern.own
-        ratio = pattern.apart / factors
-    factors, ratio = factors[:, :-1], ratio[:, :-1]
-    np.multiply.accumulate(factors, axis=1, out=value[:, 1:])
+        factors = angle + own
+        factors, ratio = np.concatenate((factors, (1.0 - own) / factors)).take(pattern.picks[:2], axis=0)
+    sums = np.zeros((max(order, 1) + 1, *ratio.shape))  # V e_k
+    value, higher = sums[0], sums[1:]
+    value[0] = 1.0
+    np.multiply.accumulate(factors[:-1], axis=0, out=value[1:])
+    ratio = ratio[:-1]
     terms = ratio
     for k in range(1, order + 1):
-        np.add.accumulate(terms, axis=1, out=sums[k, :, 1:])
+        np.add.accumulate(terms, axis=0, out=sums[k, 1:])
         if k < order:
-            terms = ratio * sums[k, :, :-1]
-    sums[1:] *= value
+            terms = ratio * sums[k, :-1]
+    higher *= value
     if half:
-        turned = half * sine[1] * sums[:-1]
-        sums *= cosine[1]
-        sums[1:] -= turned
+        turned = sine * sums[:-1]
+        sums *= cosine
+        higher -= turned
         if order > 1:
-            sums[2:] -= (half * half) * pattern.cosines * sums[:-2]
+            highest = sums[2:]
+            highest -= _reduction(pattern, half) * sums[:-2]
     return sums.ravel().take(places).T
+
+
+@lru_cache(maxsize=256)
+def _reduction(pattern: Pattern, half: float) -> Array:
+    """Reduction of sums 2 and 3 by powers of cosines, (order - 1, nconstraints, nwaypoints)."""
+    return readonly((half * half) * pattern.cosines)
 
 
 def _next(ratio: Array, lower: Array | Sequence[Array], bend: float) -> Array:
@@ -718,7 +743,7 @@ def _identity(size: int) -> Array:
     return readonly(np.asfortranarray(np.eye(size)))
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)  # few enough to stay in the second cache of a processor
 def shared_system(
     alpha: float,
     times: tuple[float, ...],
@@ -733,18 +758,43 @@ def shared_system(
 
 
 @lru_cache(maxsize=256)
-def _taylor_scale(duration: float, orders: tuple[int, ...]) -> Array:
-    """Powers of a duration over factorials, as a column."""
+def _taylor_scale(duration: float, pattern: Pattern) -> Array:
+    """Powers of a duration over factorials by constraint, as a column."""
+    order = pattern.order
     try:
-        powers = [duration**k / math.factorial(k) for k in range(max(orders) + 1)]
+        powers = [duration**k / math.factorial(k) for k in range(order + 1)]
     except OverflowError:
         powers = [0.0]
     if not 1e-290 < powers[-1] < math.inf:
         raise ValueError(
             f"powers of the duration must stay within floating point, got {duration:g} s to the power "
-            f"{max(orders)}; choose another unit of time"
+            f"{order}; choose another unit of time"
         )
-    return readonly(np.array([[powers[k]] for k in orders]))
+    return readonly(np.array(powers).take(pattern.orders)[:, None])
+
+
+@lru_cache(maxsize=256)
+def _coarse_ranges(pattern: Pattern, size: int, closed: bool, turns: bool) -> Array:
+    r"""Bounds of the ranges of functions for any times of waypoints, the last one at the end if `closed`.
+
+    A factor is at most the distance to its node. Of a nodes at the start and b at the
+    end the product is at most
+
+    .. math:: \max_u u^a (1 - u)^b = a^a b^b / (a + b)^{a + b}
+
+    and does not change its sign. Of the other factors, squares are at most 1, and so
+    are the ranges, with 0, of one other and of a product of two. A cosine is at most 1,
+    and changes its sign only if `turns`, for alpha above pi.
+    """
+    spare = range(pattern.nwaypoints, pattern.nwaypoints + size - len(pattern.at))
+    found, first, last = [0.0], 0, pattern.nwaypoints - 1 if closed else -1
+    counts = dict.fromkeys((first, last, *pattern.at, *spare), 0)
+    for number, node in enumerate((*pattern.at, *spare)[: size - 1], 1):
+        counts[node] += 1
+        a, b = counts[first], counts[last]
+        odd = sum([count % 2 for other, count in counts.items() if other not in (first, last)])
+        found.append(a**a * b**b / (a + b) ** (a + b) * (2.0 if odd > 2 or (turns and number % 2) else 1.0))
+    return readonly(np.array(found))
 
 
 def _ranges(alpha: float, nodes: list[float], peaks: list[tuple[float, float]]) -> list[float]:
@@ -897,31 +947,30 @@ class Pattern:
 
     @cached_property
     def own(self) -> Array:
-        """1 for a node at the waypoint itself, else 0, (nwaypoints, nconstraints)."""
-        return readonly((np.arange(self.nwaypoints)[:, None] == self.waypoints).astype(float))
+        """1 for a node (rows) at the waypoint itself, else 0, with a last row of 1, (nwaypoints + 1, nwaypoints)."""
+        return readonly(np.vstack([np.eye(self.nwaypoints), np.ones(self.nwaypoints)]))
 
     @cached_property
-    def apart(self) -> Array:
-        """0 for a node at the waypoint itself, else 1."""
-        return readonly(1.0 - self.own)
-
-    @cached_property
-    def halves(self) -> Array:
-        """1 for the sine of each node, and for the cosine of every second one, (2, 1, nconstraints)."""
-        number = np.arange(len(self.at))
-        return readonly(np.array([[number >= 0], [number % 2 == 1]], dtype=float))
+    def picks(self) -> NDArray[np.intp]:
+        """Rows of the factors, ratios, cosines and sines of `_products_at_nodes` by function, (4, nconstraints)."""
+        rows = self.nwaypoints + 1
+        turned = np.where(np.arange(len(self.at)) % 2 == 1, self.waypoints, self.nwaypoints)
+        found = np.array([self.waypoints, rows + self.waypoints, 2 * rows + turned, 3 * rows + turned])
+        found.flags.writeable = False
+        return found
 
     @cached_property
     def zeros(self) -> NDArray[np.intp]:
-        """Number of sines of each function that are 0 at a waypoint, (nwaypoints, nconstraints)."""
-        found = np.zeros(self.own.shape, dtype=np.intp)
-        np.cumsum(self.own[:, :-1], axis=1, out=found[:, 1:], dtype=np.intp)
+        """Number of sines of each function that are 0 at a waypoint, (nconstraints, nwaypoints)."""
+        own = self.waypoints[:, None] == np.arange(self.nwaypoints)
+        found = np.zeros(own.shape, dtype=np.intp)
+        np.cumsum(own[:-1], axis=0, out=found[1:], dtype=np.intp)
         found.flags.writeable = False
         return found
 
     @cached_property
     def places(self) -> NDArray[np.intp] | None:
-        """Place in the sums of `_products_at_nodes` of each function, by constraint.
+        """Place in the sums of `_products_at_nodes` of each function (rows), by constraint (columns).
 
         Coefficients below the number of factors that are 0 are 0, as the first sum of
         order 1 is. None for many constraints or high orders.
@@ -929,18 +978,30 @@ class Pattern:
         count = len(self.at)
         if count > _STORED or self.order > _ELEMENTARY:
             return None
-        left = self.orders - self.zeros[self.waypoints].T
-        found = (left * self.nwaypoints + self.waypoints) * count + np.arange(count)[:, None]
+        left = self.orders - self.zeros[:, self.waypoints]
+        found = (left * count + np.arange(count)[:, None]) * self.nwaypoints + self.waypoints
         found = np.where(left >= 0, found, self.nwaypoints * count)
         found.flags.writeable = False
         return found
 
     @cached_property
     def cosines(self) -> Array:
-        """Reduction of sums 2 and 3 by powers of cosines, (order - 1, nwaypoints, nconstraints)."""
+        """Reduction of sums 2 and 3 by powers of cosines for alpha = 2, (order - 1, nconstraints, nwaypoints)."""
         number, orders = np.arange(float(len(self.at))), np.arange(self.order - 1)[:, None, None]
-        factors = number + number % 2.0  # of each function
+        factors = (number + number % 2.0)[:, None]  # of each function
         return readonly((3.0 * factors - 2.0 * (orders + self.zeros)) / 6.0)
+
+
+@lru_cache(maxsize=256)
+def _weights(pattern: Pattern, alpha: float) -> Array | None:
+    """Reciprocals of the largest entry of each column of the triangle for even times, as a matrix.
+
+    None for many constraints or high orders.
+    """
+    if pattern.places is None:
+        return None
+    even = np.abs(_products_at_nodes(_grid(pattern.nwaypoints), 0.5 * alpha, pattern, pattern.places))
+    return readonly(np.asfortranarray(np.broadcast_to(1.0 / even.max(axis=0), even.shape)))
 
 
 def _pattern(ordered: tuple[int, ...], given: tuple[tuple[int, ...], ...], meet: bool) -> Pattern:
@@ -970,8 +1031,8 @@ def _leja(
     coincide come first: as their data agree, the divided differences between them
     are 0 or small, and no others are divided by their distance.
     """
-    used = [i for i, own in enumerate(given) if own]
-    u = times if len(used) == len(times) else [times[i] for i in used]
+    used = None if all(given) else [i for i, own in enumerate(given) if own]
+    u = times if used is None else [times[i] for i in used]
     half, last, sin = 0.5 * alpha, len(u) - 1, math.sin
     product = [abs(sin(half * (w - u[0]))) for w in u] if half else [w - u[0] for w in u]
     if meet:
@@ -990,7 +1051,7 @@ def _leja(
                 product = [p * (abs(w - v) / scale) for p, w in zip(product, u, strict=True)]
     if last:
         chosen.append(last * (last + 1) // 2 - sum(chosen))  # the only one that is left
-    return tuple([used[i] for i in chosen]), meet
+    return tuple(chosen if used is None else [used[i] for i in chosen]), meet
 
 
 def _sequence(waypoints: tuple[int, ...], given: tuple[tuple[int, ...], ...]) -> list[tuple[int, int]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from operator import sub
 from typing import Any, NamedTuple, Self
 
@@ -139,20 +139,13 @@ class NewtonSpline(WaypointSpline):
         table, patterns = given_entries(waypoints)
         systems: dict[Kind, NewtonSystem] = {}
         parts, near = [], options.warn
-        for kind, axes in _groups(patterns, options.gamma, _meeting(table, alpha)).items():
-            given, _, _ = kind
-            system = lent.get(kind)
-            if system is None:
-                size = _size(alpha, sum(map(len, given)), options.degree)
-                system = _system(alpha, relative, apart, kind, size, options.smooth)
+        for kind, axes in _groups(patterns, options.gamma, table, alpha).items():
+            system = lent.get(kind) or _system(alpha, relative, apart, kind, options)
             systems[kind] = system
             data = system.entries(table)
             if len(axes) < table.shape[2]:
                 data = data[:, axes]
-            found = _fitted(system, data, times, duration)
-            near = near and system.stays_near(found, data)
-            if not near:
-                _check_finite(found, data, duration)
+            found, near = _fitted(system, data, times, duration, near)
             parts.append((axes, system, found))
         if donor is not None and len(donor.labels) == table.shape[2]:
             labels = donor.labels
@@ -347,29 +340,34 @@ class NewtonSpline(WaypointSpline):
 
 
 def _system(
-    alpha: float, relative: tuple[float, ...], apart: Array | None, kind: Kind, size: int | None, smooth: int
+    alpha: float, relative: tuple[float, ...], apart: Array | None, kind: Kind, options: SplineOptions
 ) -> NewtonSystem:
     """System for a pattern of entries; of few entries that of earlier plans with the same relative times."""
     given, gamma, meet = kind
-    if apart is None and (size or sum(map(len, given))) <= _SHARED:
-        return shared_system(alpha, relative, given, gamma, size, smooth, meet)
-    return NewtonSystem(alpha, np.array(relative), given, gamma, size, smooth, meet, apart)
+    count = sum(map(len, given))
+    size = None if options.degree is None else _size(alpha, count, options.degree)
+    if apart is None and (size or count) <= _SHARED:
+        return shared_system(alpha, relative, given, gamma, size, options.smooth, meet)
+    return NewtonSystem(alpha, np.array(relative), given, gamma, size, options.smooth, meet, apart)
 
 
-def _fitted(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:
-    """Coefficients from prescribed derivatives (nconstraints, naxes), which may overflow."""
-    scale = system.taylor_scale(duration)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return system.fitted(data, times, duration, data * scale)
+@np.errstate(over="ignore", invalid="ignore")
+def _fitted(system: NewtonSystem, data: Array, times: list[float], duration: float, check: bool) -> tuple[Array, bool]:
+    """Coefficients from prescribed derivatives (nconstraints, naxes), and whether a check excludes a swing.
 
-
-def _check_finite(found: Array, data: Array, duration: float) -> None:
-    """Raise for coefficients that are not finite."""
-    if not (are_finite(found.T) or np.isfinite(found).all()):
+    Raises
+    ------
+    ValueError
+        If a coefficient overflows, or is too inaccurate.
+    """
+    found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
+    near = check and system.stays_near(found, data)
+    if not near and not (are_finite(found.T) or np.isfinite(found).all()):
         raise ValueError(
             "coefficients must stay within floating point, got an overflow from "
             f"waypoint entries of up to {np.abs(data).max():g} over {duration:g} s"
         )
+    return found, near
 
 
 def _apart(times: list[float], relative: tuple[float, ...], duration: float) -> Array | None:
@@ -386,10 +384,8 @@ def _same_pattern(donor: NewtonSpline, relative: tuple[float, ...], apart: Array
     return apart is None or (donor._apart is not None and np.array_equal(donor._apart, apart))
 
 
-def _size(alpha: float, count: int, degree: int | None) -> int | None:
-    """Number of coefficients at a degree; None for the number of constraints."""
-    if degree is None:
-        return None
+def _size(alpha: float, count: int, degree: int) -> int:
+    """Number of coefficients at a degree."""
     minimum = count // 2 if alpha else count - 1
     if degree < minimum:
         raise ValueError(f"degree must be at least {minimum} for {count} constraints per axis, got {degree}")
@@ -399,11 +395,11 @@ def _size(alpha: float, count: int, degree: int | None) -> int | None:
 def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
     """Entries (waypoint, order, axis), and the orders prescribed at each waypoint for each axis."""
     jets = [w.jet for w in waypoints]
-    sizes = list(map(len, jets))
-    if len(set(sizes)) == 1 and all([w.complete for w in waypoints]):
-        table = joined(jets).reshape(len(jets), *jets[0].shape)
-        return table, [(tuple(range(sizes[0])),) * len(sizes)] * waypoints[0].naxes
-    table = np.full((len(jets), max(sizes), jets[0].shape[1]), np.nan)
+    sizes, naxes = {len(jet) for jet in jets}, waypoints[0].naxes
+    if len(sizes) == 1 and all([w.complete for w in waypoints]):
+        (size,) = sizes
+        return joined(jets).reshape(len(jets), size, naxes), [_complete(len(jets), size)] * naxes
+    table = np.full((len(jets), max(sizes), naxes), np.nan)
     for row, jet in zip(table, jets, strict=True):
         row[: len(jet)] = jet
     known = ~np.isnan(table)
@@ -411,10 +407,14 @@ def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
     return table, patterns
 
 
-def _meeting(table: Array, alpha: float) -> list[bool]:
-    """Whether the first and last position of each axis agree; only near alpha = 2 pi, where ends may coincide."""
-    if alpha < NEARLY_CLOSED:
-        return [False] * table.shape[2]
+@lru_cache(maxsize=128)
+def _complete(count: int, size: int) -> Given:
+    """Orders of waypoints that all prescribe the same number of them."""
+    return (tuple(range(size)),) * count
+
+
+def _meeting(table: Array) -> list[bool]:
+    """Whether the first and last position of each axis agree."""
     found = []
     for positions in table[:, 0].T:
         known = positions[~np.isnan(positions)]
@@ -423,11 +423,15 @@ def _meeting(table: Array, alpha: float) -> list[bool]:
 
 
 def _groups(
-    patterns: list[Given], gamma: float | list[float | None] | None, meeting: list[bool]
+    patterns: list[Given], gamma: float | list[float | None] | None, table: Array, alpha: float
 ) -> dict[Kind, tuple[int, ...]]:
-    """Axes with the same pattern of prescribed entries, gamma and coinciding ends."""
-    if gamma is None and patterns.count(patterns[0]) == len(patterns) and len(set(meeting)) == 1:
-        return {(patterns[0], None, meeting[0]): tuple(range(len(patterns)))}
+    """Axes with the same pattern of prescribed entries, gamma and coinciding ends, which only exist near 2 pi."""
+    if alpha < NEARLY_CLOSED:
+        if gamma is None and patterns.count(patterns[0]) == len(patterns):
+            return {(patterns[0], None, False): tuple(range(len(patterns)))}
+        meeting = [False] * len(patterns)
+    else:
+        meeting = _meeting(table)
     gammas = gamma if isinstance(gamma, list) else [gamma] * len(patterns)
     groups: dict[Kind, tuple[int, ...]] = {}
     for axis, kind in enumerate(zip(patterns, gammas, meeting, strict=True)):

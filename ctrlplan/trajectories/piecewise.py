@@ -386,7 +386,7 @@ class PiecewiseSpline(WaypointSpline):
 
     def _check_swing(self) -> None:
         """Warn, unless disabled, if the plan swings far beyond its waypoints."""
-        if self._warn and not self._stays_near():
+        if self._warn and not self._is_small() and not self._stays_near():
             ends = np.full((self.naxes, 2), [np.inf, -np.inf])
             for pieces in self._pieces:
                 for run in pieces.runs:
@@ -407,8 +407,6 @@ class PiecewiseSpline(WaypointSpline):
             return False
         positions = self._entries.rows[:, 0]
         spans = _spans(positions)
-        if positions.size <= _MANY_POSITIONS and self._is_small(spans):
-            return True
         for pieces in self._pieces:
             for run in pieces.runs:
                 if not run.system.hermite:
@@ -426,14 +424,19 @@ class PiecewiseSpline(WaypointSpline):
                         return False
         return True
 
-    def _is_small(self, spans: list[float]) -> bool:
+    def _is_small(self) -> bool:
         """Whether the coefficients of all axes and segments together are small next to the range of each axis.
+
+        Not for many waypoints, of which the values decide as fast.
 
         What the other functions of a segment add to the way from position to position
         goes up and down by at most the sum of their ranges in all. By Schwarz's
         inequality the root of all squares bounds that of one segment, and with the root
         of 2 that of two segments, one of which may go up and the other one down.
         """
+        positions = self._entries.rows[:, 0]
+        if self.alpha > math.pi or positions.size > _MANY_POSITIONS:
+            return False
         bound = 0.0
         for pieces in self._pieces:
             for run in pieces.runs:
@@ -443,8 +446,9 @@ class PiecewiseSpline(WaypointSpline):
                 bound = max(bound, run.system.higher_norm * math.sqrt(flat.dot(flat)))
         if not bound > _TINY:  # squares may have underflowed
             return False
-        room = 2.0 * _ROOM if self.breakpoints.size == 2 else _ROOM * math.sqrt(2.0)
-        return all([bound <= room * span for span in spans])
+        needed = bound / (2.0 * _ROOM if self.breakpoints.size == 2 else _ROOM * math.sqrt(2.0))
+        # The sum is nan if a position is free.
+        return all([needed <= max(own) - min(own) and sum(own) < math.inf for own in positions.tolist()])
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._checks import checked_finite, default_labels, new_numbers
 from ctrlplan._display import Displayed, Part, Table, counted, number, shortened
 from ctrlplan._types import Data
-from ctrlplan.trajectories.common import Array, are_finite, readonly, times_powers
+from ctrlplan.trajectories.common import Array, readonly, times_powers
 from ctrlplan.trajectories.fields import Fields
 
 ENTRIES = ("position", "velocity", "acceleration", "jerk", "snap")
@@ -81,8 +82,12 @@ class Waypoint(Displayed, Fields):
         entries = [position, velocity, acceleration, jerk, snap]
         while len(entries) > 1 and entries[-1] is None:
             entries.pop()
-        rows = _rows(entries)
-        self._set(checked_finite(time, "time"), _jet(entries) if rows is None else rows, None)
+        jet = _rows(entries)
+        if jet is None:
+            jet = _plain(entries)
+        if type(time) is not float or not math.isfinite(time):
+            time = checked_finite(time, "time")
+        self._set(time, _jet(entries) if jet is None else jet, None)
 
     @classmethod
     def from_jets(cls, time: float, /, **jets: Sequence[float | None]) -> Waypoint:
@@ -150,12 +155,14 @@ class Waypoint(Displayed, Fields):
         return self
 
     def _set(self, time: float, jet: Array, labels: tuple[str, ...] | None) -> None:
-        complete = are_finite(jet) or bool(np.isfinite(jet).all())
+        # The sum of a few numbers is faster than a call of numpy; it is finite only if all are.
+        complete = math.isfinite(sum(jet.ravel().tolist())) or bool(np.isfinite(jet).all())
         if not complete and np.isinf(jet).any():
             order, axis = np.argwhere(np.isinf(jet))[0]
             name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
             raise ValueError(f"{name} must be finite or nan (free), got {jet[order, axis]} at time {time:g}")
-        self._fill(time=time, jet=readonly(jet), labels=labels, complete=complete, naxes=jet.shape[1])
+        jet.setflags(write=False)
+        self._fill(time=time, jet=jet, labels=labels, complete=complete, naxes=jet.shape[1])
 
     @property
     def position(self) -> Array:
@@ -347,7 +354,8 @@ def joined(jets: Sequence[Array]) -> Array:
     """Entries of all jets, one after the other, in one row."""
     try:
         # A quarter of the time of np.concatenate.
-        return np.frombuffer(b"".join(cast("Sequence[bytes]", jets)))
+        buffers: Any = jets
+        return np.frombuffer(b"".join(buffers))
     except TypeError:  # not contiguous: parts of a larger table
         return np.concatenate([jet.ravel() for jet in jets])
 
@@ -375,18 +383,55 @@ def _prescribed(value: float) -> str:
     return "free" if value != value else number(value)
 
 
-def _rows(entries: list[ArrayLike | None]) -> Array | None:
+def _rows(entries: list[Any]) -> Array | None:
     """Table (order, axis) of arrays of floats of one shape; None for all other entries."""
-    first = entries[0]
-    if type(first) is not np.ndarray or first.ndim != 1 or not first.size:
+    shape: tuple[int, ...] = entries[0].shape if type(entries[0]) is np.ndarray else ()
+    if len(shape) != 1 or not shape[0]:
         return None
     for entry in entries:
-        if type(entry) is not np.ndarray or entry.dtype != _DOUBLE or entry.shape != first.shape:
+        if type(entry) is not np.ndarray or entry.dtype is not _DOUBLE or entry.shape != shape:
             return None
-    return joined(cast("Sequence[Array]", entries)).reshape(len(entries), -1)
+    return joined(entries).reshape(len(entries), -1)
 
 
 _DOUBLE = np.dtype(float)
+
+
+def _plain(entries: list[Any]) -> Array | None:
+    """The same of numbers, and of lists and arrays of as many; None for all other entries."""
+    kinds = set(map(type, entries))
+    if kinds <= _NUMBERS:
+        return _array(entries, 1)
+    if np.ndarray in kinds:
+        entries = [
+            entry.tolist() if type(entry) is np.ndarray and entry.dtype is _DOUBLE else entry for entry in entries
+        ]
+    sizes = {len(entry) for entry in entries if type(entry) in _ROWS}
+    if len(sizes) != 1 or 0 in sizes:
+        return None
+    (naxes,) = sizes
+    flat: list[Any] = []
+    for cell in entries:
+        kind = type(cell)
+        if kind in _ROWS:
+            flat += cell
+        elif kind in _NUMBERS and (naxes == 1 or not cell or cell != cell):
+            flat += [cell] * naxes
+        else:
+            return None
+    return _array(flat, naxes) if _NUMBERS.issuperset(map(type, flat)) else None
+
+
+def _array(flat: list[Any], naxes: int) -> Array | None:
+    """Table (order, axis) of numbers, None as nan; None if one of them overflows."""
+    try:
+        return np.array(flat, dtype=float).reshape(-1, naxes)
+    except OverflowError:
+        return None
+
+
+_ROWS = frozenset({list, tuple})
+_NUMBERS = frozenset({float, int, type(None), np.float64})
 
 
 def _jet(entries: list[ArrayLike | None]) -> Array:

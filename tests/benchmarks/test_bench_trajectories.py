@@ -63,7 +63,7 @@ def meets(plan, times, jets=JETS):
 @pytest.mark.parametrize("alpha", [0.0, ALPHA])
 @pytest.mark.parametrize("waypoints", ["with waypoints", "without waypoints"])
 def test_construct_at_new_times(beside, waypoints, alpha):
-    """Peer: BPoly.from_derivatives of the same data. Wanted: at most 0.8."""
+    """Peer: BPoly.from_derivatives of the same data. Goal: at most 0.5."""
     inputs = [(times, points(times)) for times in new_times(300)]
     if waypoints == "with waypoints":
 
