@@ -107,10 +107,10 @@ def plan_excess_length(plan: Trajectory) -> float:
 _GRADED = np.array([0.0, *0.1 ** np.arange(4.0)[::-1]])[:, None]
 """Ends of the finer panels on either side of a minimum of the speed."""
 
-_NODES, _PANELS = 16, np.linspace(0.0, 1.0, 13)
+_NODES, _PANELS = 16, np.linspace(0.0, 1.0, 33)
 """Number of nodes of a panel, and ends of the panels of a segment."""
 
-_ROUGH, _PASSES = 3e-7, 6
+_ROUGH, _PASSES = 3e-8, 6
 """Last Legendre coefficients of the speed, relative to the length of the segment, above which a panel is divided, and
 how often."""
 

@@ -10,6 +10,9 @@ from scipy.optimize import minimize_scalar
 
 from ctrlplan.trajectories.common import Array
 
+_ROUNDING = 16.0 * np.finfo(float).eps
+"""Rise to both neighbours, relative to a value, up to which there is no valley but rounding errors."""
+
 
 def scan(
     function: Callable[[float], float],
@@ -95,4 +98,5 @@ def _valleys(values: Array, target: float) -> list[int]:
     # A parabola falls below the middle of three points by at most an eighth of the rise of the ends; allow ten times.
     with np.errstate(invalid="ignore"):
         rise = np.where(np.isfinite(left), left, here) + np.where(np.isfinite(right), right, here) - 2.0 * here
-        return np.flatnonzero(low & ~(here - 1.25 * rise > target)).tolist()
+        level = np.maximum(left, right) - here <= _ROUNDING * np.abs(here)
+        return np.flatnonzero(low & ~level & ~(here - 1.25 * rise > target)).tolist()

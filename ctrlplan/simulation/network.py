@@ -19,7 +19,6 @@ from operator import methodcaller
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -464,7 +463,7 @@ def _flattened(system: System, above: Params) -> _Part:
     params = {**system.params, **above}
     parts = [_flattened(block, params) for block in system.syslist]
     inner, outer, read, through = (
-        block_diag(*(getattr(p, name) for p in parts)) for name in ("inner", "outer", "read", "through")
+        _block_diagonal([getattr(p, name) for p in parts]) for name in ("inner", "outer", "read", "through")
     )
     connect = np.asarray(system.connect_map, dtype=float)
     external = np.asarray(system.input_map, dtype=float).reshape(len(connect), system.ninputs or 0)
@@ -483,6 +482,16 @@ def _flattened(system: System, above: Params) -> _Part:
         from_out @ read + passed @ v_y,
         passed @ v_r,
     )
+
+
+def _block_diagonal(matrices: Sequence[Array]) -> Array:
+    """Block-diagonal matrix; that of scipy takes most of the time of a network of small blocks."""
+    found = np.zeros((sum(len(m) for m in matrices), sum(m.shape[1] for m in matrices)))
+    row = column = 0
+    for m in matrices:
+        found[row : row + len(m), column : column + m.shape[1]] = m
+        row, column = row + len(m), column + m.shape[1]
+    return found
 
 
 def _innermost(system: System, above: Params) -> _Part:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from repetitions import examples
 from scipy.integrate import quad
 from scipy.interpolate import BPoly, PPoly
+from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan import Waypoint
@@ -95,6 +96,17 @@ def test_plan_length_of_a_parabola():
 def test_plan_length_counts_the_way_there_and_back():
     there_and_back = MOVE.then(cp.PolySpline([Waypoint(1, 1, 0, 0), Waypoint(3, -2, 0, 0)]))
     assert plan_length(there_and_back) == pytest.approx(4.0, rel=1e-14)
+
+
+@pytest.mark.parametrize("alpha", np.linspace(3.2, 6.2, 30).tolist())
+def test_plan_length_of_a_straight_move_that_reverses(alpha):
+    plan = cp.TrigSpline([Waypoint(0, [0, 10], 0, 0), Waypoint(15, [20, 11], 0, 0)], alpha=alpha, warn=False)
+    t = np.linspace(0.0, 15.0, 4001)[1:-1]  # at rest at both ends
+    slope = plan.jet(t, 1)[1, 0]
+    cells = np.flatnonzero(slope[1:] * slope[:-1] < 0.0)
+    turns = [brentq(lambda s: plan.jet(s, 1)[1, 0], *t[k : k + 2], xtol=1e-14) for k in cells.tolist()]
+    way = np.abs(np.diff(plan.jet([0.0, *turns, 15.0], 0)[0, 0])).sum()
+    assert plan_length(plan) == pytest.approx(way * np.hypot(20.0, 1.0) / 20.0, rel=1e-8)
 
 
 @pytest.mark.parametrize("miss", [1e-2, 1e-4, 0.0])
