@@ -208,8 +208,9 @@ def _is_of_draws(loop: object, table: dict[str, Array]) -> TypeGuard[Callable[..
     except (TypeError, ValueError):  # of some built-in functions
         return False
     named = set(signature.parameters)
-    further = [one for name, one in signature.parameters.items() if name not in table]
-    takes_any = bool(further) and all(one.kind is inspect.Parameter.VAR_KEYWORD for one in further)  # **values
+    further = {one.kind for name, one in signature.parameters.items() if name not in table}
+    takes_any = inspect.Parameter.VAR_KEYWORD in further  # **values, or a wrapper's *arguments, **values
+    takes_any &= further <= {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
     if (set(table) <= named or takes_any) and _binds(signature, **dict.fromkeys(table, 0.0)):
         return True
     if not _binds(signature, "", None) or set(list(signature.parameters)[:2]) & set(table):

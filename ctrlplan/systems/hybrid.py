@@ -9,7 +9,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import check_kind, checked_finite, checked_names, checked_vector
+from ctrlplan._checks import check_kind, checked_finite, checked_names, checked_vector, one_number
 from ctrlplan._renamed import former_signature
 from ctrlplan._types import Array, Params, System, Value
 from ctrlplan.traits import DeclaredTrait, declare
@@ -222,6 +222,8 @@ def create_delay_iosystem(
     >>> cp.simulate(plant, [0.0, 0.5, 1.0], cp.Step(1.0)).outputs.round(9).tolist()
     [0.0, 0.0, 0.5]
     """
+    if one_number(delay, "delay") == 0.0:
+        raise ValueError("delay must be above 0, got 0: leave the block out and connect its input directly")
     seconds = checked_finite(delay, "delay", above=0.0)
     given = checked_names("u" if inputs is None else inputs, "inputs")
     delayed = checked_names("y" if outputs is None else outputs, "outputs")

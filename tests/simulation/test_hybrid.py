@@ -311,7 +311,7 @@ def test_bad_sampled_blocks(arguments, error, match):
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
-        ({"delay": 0.0}, ValueError, "delay must be finite and above 0, got 0"),
+        ({"delay": 0.0}, ValueError, "delay must be above 0, got 0: leave the block out"),
         ({"delay": -1}, ValueError, "delay must be finite and above 0, got -1"),
         ({"delay": math.inf}, ValueError, "delay must be finite"),
         ({"delay": "1"}, TypeError, "delay must be a number, got '1'"),

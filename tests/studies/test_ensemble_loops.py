@@ -104,7 +104,10 @@ def test_a_function_of_the_parameters_is_not_taken_for_one_of_a_plan(build):
         run(build, table)
 
 
-@pytest.mark.parametrize("build", [lambda **values: lag(**values), lambda tau, **values: lag(tau=tau)])
+@pytest.mark.parametrize(
+    "build",
+    [lambda **values: lag(**values), lambda tau, **values: lag(tau=tau), lambda *rest, **values: lag(*rest, **values)],
+)
 def test_a_function_of_any_keyword_takes_the_draws(build):
     result = run(build, {"tau": [0.5, 1.0]})
     np.testing.assert_allclose(result.metrics["step"]["settling_time"], np.log(50) * np.array([0.5, 1.0]), rtol=1e-5)
