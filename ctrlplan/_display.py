@@ -138,6 +138,11 @@ def number(value: float, unit: str = "") -> str:
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value + 0.0:.4g}"
 
 
+def time_text(time: float) -> str:
+    """A time [s] without its unit: six significant digits, and from 1e4 s on microseconds."""
+    return f"{time:.6f}".rstrip("0").rstrip(".") if 1e4 <= abs(time) < 1e12 else f"{time:.6g}"
+
+
 def counted(count: int, word: str) -> str:
     """A number with its noun in the singular or plural."""
     return f"{count} {word}" if count == 1 else f"{count} {word}s"

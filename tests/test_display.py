@@ -221,6 +221,17 @@ def test_every_exported_class_is_printed_here():
     assert {*classes(), "Crane", "FlatSystem", "Study"} == set(MADE)
 
 
+@pytest.mark.parametrize("start", [0.0, 5e4, 1.7e9])
+def test_times_long_after_the_origin_are_told_apart(start):
+    """Such as seconds since 1970."""
+    plan = cp.PolySpline([cp.Waypoint(start, 0, 0, 0), cp.Waypoint(start + 1.25, 1, 0, 0)])
+    first, middle, last = (f"{start + t:.3f}".rstrip("0").rstrip(".") for t in (0.0, 0.625, 1.25))
+    assert f"from {first} s to {last} s" in repr(plan)
+    assert f"at {middle} s" in repr(cp.margins(plan, {"velocity": 1.0}))
+    with pytest.raises(ValueError, match=f"got {first} s after {last} s"):
+        plan.breakpoints_between(start + 1.25, start)
+
+
 @every
 def test_repr_is_one_line_with_the_name_of_the_class(name):
     text = repr(made(name))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._display import time_text
 from ctrlplan._types import Array
 from ctrlplan.flatness.maps import TRIALS, TRIALS_TOGETHER, FlatMaps, SingularError, inverses
 from ctrlplan.flatness.rest import ADVICE, note_of_rest
@@ -272,11 +273,11 @@ def _check_regular(maps: FlatMaps, plan: Trajectory, grid: Grid, p: Array, name:
         weak = maps.weakest(grid.interpolated(np.array([time]))[0][:, 0], p)
         raise ValueError(
             f"states of {name} must be determined along the plan, but {weak} is not determined by the flat outputs at "
-            f"{time:.6g} s{note_of_rest(plan, time)}"
+            f"{time_text(time)} s{note_of_rest(plan, time)}"
         )
     raise ValueError(
         f"inputs of {name} must be determined along the plan, but their influence on the highest derivatives of the "
-        f"flat outputs is singular at {time:.6g} s; choose a plan that does not pass this point"
+        f"flat outputs is singular at {time_text(time)} s; choose a plan that does not pass this point"
     )
 
 
@@ -407,4 +408,4 @@ def on_branch(maps: FlatMaps, x: Array, u: Array, p: Array) -> NDArray[np.bool_]
 
 def _when(time: float) -> str:
     """Time in a message; nothing for flags without one, which is nan."""
-    return "" if np.isnan(time) else f" at {time:.6g} s"
+    return "" if np.isnan(time) else f" at {time_text(time)} s"

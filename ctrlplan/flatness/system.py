@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import check_kind, checked_labels, checked_timepts, default_labels, finite_vector, real_array
-from ctrlplan._display import Displayed, Facts, Part
+from ctrlplan._display import Displayed, Facts, Part, time_text
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Value
 from ctrlplan.flatness.on_path import (
@@ -369,7 +369,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
                 what = "position" if jump.order == 0 else f"derivative {jump.order}"
                 raise ValueError(
                     f"plan must be continuous up to derivative {order_of[jump.label] - 1} of {jump.label} between "
-                    f"the times given, got one whose {what} jumps by {jump.size:.4g} at {jump.time:g} s"
+                    f"the times given, got one whose {what} jumps by {jump.size:.4g} at {time_text(jump.time)} s"
                 )
 
     def _check_determined(self, x: Array, u: Array, plan: Trajectory, times: Array) -> None:
@@ -403,5 +403,5 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         if time is not None:
             raise ValueError(
                 f"{self._undetermined[0]} of {self.name} must be determined by the plan, got one that is at rest at "
-                f"{time:.6g} s: the maps are singular there; {ADVICE}"
+                f"{time_text(time)} s: the maps are singular there; {ADVICE}"
             )

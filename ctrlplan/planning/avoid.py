@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from ctrlplan._checks import check_kind, checked_count, checked_finite
-from ctrlplan._display import Displayed, Facts, Figure, Part, title_of
+from ctrlplan._display import Displayed, Facts, Figure, Part, time_text, title_of
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope, clearance_within
 from ctrlplan.planning.clearance import clearance as certified_clearance
@@ -323,7 +323,7 @@ def _checked_plan(plan: Trajectory) -> Trajectory:
     if isinstance(plan, WaypointSpline):
         if plan.end != plan.waypoints[-1].time:
             last = plan.waypoints[-1].time
-            raise ValueError(f"plan must end at its last waypoint, at {last:g} s, got {plan.end:g} s")
+            raise ValueError(f"plan must end at its last waypoint, at {time_text(last)} s, got {time_text(plan.end)} s")
         for i, point in enumerate(plan.waypoints):
             if np.isnan(point.position).any():
                 place = f"waypoints[{i}] with {point.position}"

@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeGuard
 import numpy as np
 
 from ctrlplan._checks import checked_finite, checked_limits, checked_pair, real_array
+from ctrlplan._display import time_text
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.waypoint import ENTRIES
 
@@ -142,7 +143,7 @@ class Limits:
             k = int((rows["low"] >= rows["high"]).argmax())
             raise ValueError(
                 f"high must be above low at all times, got {rows['high'][k]:g} and {rows['low'][k]:g} at "
-                f"along[{k}] = {times[k]:g} s"
+                f"along[{k}] = {time_text(times[k])} s"
             )
         self._set(along=tuple(times.tolist()), **{name: tuple(row.tolist()) for name, row in rows.items()})
 
@@ -533,7 +534,7 @@ def _checked_rate(rate: object, during: bool) -> Pair:
 def _checked_during(during: object) -> tuple[float, float]:
     first, last = checked_pair(during, "during")
     if not (math.isfinite(first) and math.isfinite(last)):
-        raise ValueError(f"during must be two finite times, got {first:g} and {last:g}")
+        raise ValueError(f"during must be two finite times, got {time_text(first)} and {time_text(last)}")
     return first, last
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_finite, checked_number
-from ctrlplan._display import Displayed, Facts, Part, number
+from ctrlplan._display import Displayed, Facts, Part, number, time_text
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import Trajectory
@@ -92,7 +92,7 @@ class Clearance(Displayed):
         return [
             ("certified lower bound", f"{self.lower:.6g}"),
             ("minimum found", f"{self.minimum:.6g}, {rope}to obstacles[{self.obstacle}]"),
-            ("at", f"{self.time:.6g} s, position ({number(x)}, {number(z)})"),
+            ("at", f"{time_text(self.time)} s, position ({number(x)}, {number(z)})"),
             ("required", "" if self.required is None else f"{self.required:.6g}"),
         ]
 

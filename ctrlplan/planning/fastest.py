@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from ctrlplan._checks import checked_finite, checked_pair
-from ctrlplan._display import Displayed, Facts, Figure, Part
+from ctrlplan._display import Displayed, Facts, Figure, Part, time_text
 from ctrlplan._renamed import FormerAttribute, outside_stacklevel
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.durations import PlansByDuration, ReplannedPlans
@@ -185,7 +185,7 @@ class Fastest(Displayed):
                 ("shorter durations", self.statement),
                 (
                     "stops at corners of the path",
-                    ", ".join(f"at {time:.6g} s of the given plan" for time in self.stops),
+                    ", ".join(f"at {time_text(time)} s of the given plan" for time in self.stops),
                 ),
                 ("shorter plans rejected", self.rejection),
                 ("signals of the loop", self.margins.note),
@@ -616,7 +616,9 @@ def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, floa
     """Plan of minimum duration on its path, under limits of velocities, accelerations and jerks."""
     limited.check_constant('limits with hold="path"', over_time=True)
     for jump in plan.jumps(0):
-        raise ValueError(f"plan must be continuous, got {jump.label} that jumps by {jump.size:.4g} at {jump.time:g} s")
+        raise ValueError(
+            f"plan must be continuous, got {jump.label} that jumps by {jump.size:.4g} at {time_text(jump.time)} s"
+        )
     if limited.order == 3:
         limited.check_smooth(plan)
     if not limited.order:
@@ -691,7 +693,7 @@ def _check_passable(plan: Trajectory, bound: Bound, time: float) -> None:
     ):
         raise ValueError(
             f"limits of {bound.name} must not be 0 where the path moves, got from {low[-1]:.4g} to {high[-1]:.4g} at "
-            f"{time:.6g} s of the given plan; give a limit above 0 there, or stop the plan there"
+            f"{time_text(time)} s of the given plan; give a limit above 0 there, or stop the plan there"
         )
 
 
@@ -980,7 +982,7 @@ def _closed_form(plan: Trajectory, limited: Limited, highest: float = math.inf) 
             elif value > rounding:  # a sign that violates the limit at any duration
                 raise ValueError(
                     f"limits must be satisfied for some duration, got {bound.name} of both signs where it must be "
-                    f"{bound.range}: its sign at {time:.6g} s is the same at every duration"
+                    f"{bound.range}: its sign at {time_text(time)} s is the same at every duration"
                 )
     return minimum
 

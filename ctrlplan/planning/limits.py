@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctrlplan._checks import check_kind, checked_finite
-from ctrlplan._display import Displayed, Facts, Part, Table, counted
+from ctrlplan._display import Displayed, Facts, Part, Table, counted, time_text
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.naming import Naming
@@ -81,7 +81,7 @@ class Margin:
     @property
     def when(self) -> str:
         """Time as text."""
-        return "in steady state" if math.isinf(self.time) else f"at {self.time:.6g} s"
+        return "in steady state" if math.isinf(self.time) else f"at {time_text(self.time)} s"
 
     def of(self, bound: Bound) -> bool:
         """Whether it is the margin of a bound."""
@@ -156,7 +156,7 @@ class Margins(Displayed):
                 row.bound.name,
                 row.bound.range,
                 f"{row.value:.6g}",
-                "steady" if math.isinf(row.time) else f"{row.time:.6g}",
+                "steady" if math.isinf(row.time) else time_text(row.time),
                 row.share if row.fraction > -_ROUNDING else f"-{row.share}",
             )
             for row in self.rows
@@ -699,7 +699,7 @@ class Limited:
         if not first < last:
             raise ValueError(
                 f"limits of {bound.name} must apply in an interval that overlaps the plan, from {self._start:g} to "
-                f"{self._start + self._duration:g} s, got {given[0]:g} to {given[1]:g} s"
+                f"{time_text(self._start + self._duration)} s, got {time_text(given[0])} to {time_text(given[1])} s"
             )
         return first, last
 
@@ -832,7 +832,7 @@ class Limited:
                 if last <= self._start or first >= self._start + self._duration:
                     raise ValueError(
                         f"during of {bound.name} must overlap the plan, from {self._start:g} to "
-                        f"{self._start + self._duration:g} s, got {first:g} to {last:g} s"
+                        f"{time_text(self._start + self._duration)} s, got {time_text(first)} to {time_text(last)} s"
                     )
             return bound
         if bound.in_loop and not bound.profile.times:
@@ -848,7 +848,10 @@ class Limited:
             size = np.abs(np.concatenate([low, high]))
         size = size[np.isfinite(size)]
         if not size.size:
-            raise ValueError(f"limits of {bound.name} must contain a finite one, got none from {first:g} to {last:g} s")
+            raise ValueError(
+                f"limits of {bound.name} must contain a finite one, got none from {time_text(first)} to "
+                f"{time_text(last)} s"
+            )
         return replace(bound, scale=float(size.max()) or 1.0)
 
     def _slackened(self, plan: Trajectory) -> Iterator[Bound]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import check_kind, checked_finite, checked_vector
+from ctrlplan._display import time_text
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.naming import Naming
@@ -100,7 +101,7 @@ def at_velocity(
 def checked_moment(plan: Trajectory, time: float) -> float:
     """Time within a plan that has a duration."""
     if not plan.duration:
-        raise ValueError(f"plan must have a duration to be stopped, got a step at {plan.start:g} s")
+        raise ValueError(f"plan must have a duration to be stopped, got a step at {time_text(plan.start)} s")
     moment = checked_finite(time, "time")
     if not plan.start <= moment <= plan.end:
         when = "before its start" if moment < plan.start else "after its end"
@@ -261,10 +262,10 @@ def _excesses(tail: Trajectory, bounds: tuple[Bound, ...]) -> Iterator[str]:
         )
         if bound.excess(np.array([value]))[0] > (_UNRESOLVED if rounded else _EXCESS):
             limit = bound.high if value > bound.high else bound.low
-            reason = f"from the state at {tail.start:.6g} s this is unavoidable"
+            reason = f"from the state at {time_text(tail.start)} s this is unavoidable"
             if rounded:
                 reason = "floating-point times do not resolve its phases; use a time origin nearer to the plan"
             yield (
                 f"the limits of the stop are exceeded: {bound.name} must be {bound.range}, got {value:.6g} at "
-                f"{time:.6g} s, {abs(value - limit):.3g} beyond; {reason}"
+                f"{time_text(time)} s, {abs(value - limit):.3g} beyond; {reason}"
             )

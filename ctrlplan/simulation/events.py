@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from ctrlplan._display import time_text
 from ctrlplan._types import Array, EventName
 
 _BEFORE, _NEWTON, _STEPS = 5, 6, 12
@@ -102,9 +103,11 @@ class Occurrence:
         """Time, name and kind in words."""
         end = ", where the run ends" if self.stop else ""
         if isinstance(self.name, EventName) and (self.kind != "inside" or not self.name.words):
-            return f"{self.time:.6g} s: {what_happened(self.name)}{' (end)' if self.kind == 'inside' else ''}{end}"
+            return (
+                f"{time_text(self.time)} s: {what_happened(self.name)}{' (end)' if self.kind == 'inside' else ''}{end}"
+            )
         where = "within its limits" if self.kind == "inside" else f"{self.kind} its limit"
-        return f"{self.time:.6g} s: {self.name} {where}{end}"
+        return f"{time_text(self.time)} s: {self.name} {where}{end}"
 
 
 def what_happened(name: str) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import ctrlplan
 from ctrlplan._checks import real_array
-from ctrlplan._display import Displayed, Facts, Part, counted, title_of
+from ctrlplan._display import Displayed, Facts, Part, counted, time_text, title_of
 from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event
 from ctrlplan.simulation.built_forms import shared_forms
@@ -478,7 +478,7 @@ def _check_start(start: float | None, plans: Iterable[Trajectory], times: Array)
             raise ValueError(
                 f"timepts must extend beyond the start of the plans at {since:g} s, got {end:g} s as the last"
             )
-        raise ValueError(f"start must leave at least two of timepts, which end at {end:g} s, got {start!r}")
+        raise ValueError(f"start must leave at least two of timepts, which end at {time_text(end)} s, got {start!r}")
 
 
 def _check_band(band: float) -> None:

@@ -123,6 +123,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._display import time_text
 from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data
 from ctrlplan.planning.bounds import limit_words
@@ -418,7 +419,9 @@ def load_study(path: str | os.PathLike[str], *, status: Callable[[str], object] 
     t_end = data["t_end"]
     moving = _ends_in_motion(waypoints)
     if t_end < waypoints[-1].time or (t_end == waypoints[-1].time and not moving):
-        raise reader.error("t_end", f"must be after the last waypoint at {waypoints[-1].time:g} s, got {t_end:g}")
+        raise reader.error(
+            "t_end", f"must be after the last waypoint at {time_text(waypoints[-1].time)} s, got {time_text(t_end)}"
+        )
     kind.check(loop, source)
     check_variations(data, kind, reader)
     benefit = reader.benefit(data)
@@ -427,7 +430,9 @@ def load_study(path: str | os.PathLike[str], *, status: Callable[[str], object] 
     found = planned(data, waypoints, kind.plant(loop, source), kind.limited(loop, source), reader, status)
     for name, plan in found.plans.items():
         if plan.end > t_end or (plan.end == t_end and not moving):
-            raise reader.error("t_end", f"must be after the end of the plan {name} at {plan.end:g} s, got {t_end:g}")
+            raise reader.error(
+                "t_end", f"must be after the end of the plan {name} at {time_text(plan.end)} s, got {time_text(t_end)}"
+            )
     check_measured(data.get("measured", {}), found.plans, reader)
     _check_memory(data["samples"], len(found.plans), benefit, f"{source}: samples")
     experiment = reader.experiment(data.get("experiment", {}), found.plans, (waypoints[0].time, t_end))
@@ -577,4 +582,4 @@ def _planning_notes(found: Planned) -> Iterator[str]:
 def _described(plan: Trajectory) -> str:
     alpha = getattr(plan, "alpha", None) if "alpha" in getattr(plan, "options", ()) else None
     shape = "" if alpha is None else f", alpha = {alpha:g} rad"
-    return f"{type(plan).__name__}{shape}, {plan.start:g} to {plan.end:g} s"
+    return f"{type(plan).__name__}{shape}, {time_text(plan.start)} to {time_text(plan.end)} s"

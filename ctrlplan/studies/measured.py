@@ -11,6 +11,7 @@ import control as ct
 import numpy as np
 
 from ctrlplan._checks import checked_finite
+from ctrlplan._display import time_text
 from ctrlplan._types import Array
 from ctrlplan.simulation import SimulationResponse, measured_response
 from ctrlplan.studies.alignment import Known, Offset, OfPlan, OfSamples, Pair, find_offset
@@ -318,10 +319,10 @@ class _Alongside:
             apart[inside] = np.minimum(apart[inside], np.abs(own - np.take(common, k, mode="clip"))[inside])
         where = (
             f"resampled: {own.size} of {self.t.size} samples, every {1e3 * step:.4g} ms, and linear interpolation at "
-            f"the {common.size} times of the simulation from {first:.6g} to {last:.6g} s"
+            f"the {common.size} times of the simulation from {time_text(first)} to {time_text(last)} s"
         )
         if first > given[0] + step or last < given[-1] - step:
-            where += f"; metrics cover this time only, of {given[0]:.6g} to {given[-1]:.6g} s"
+            where += f"; metrics cover this time only, of {time_text(given[0])} to {time_text(given[-1])} s"
         return np.union1d(common, own[apart > 1e-6 * step]), where
 
     def _metrics(self, response: SimulationResponse) -> tuple[dict[str, float], dict[str, str]]:

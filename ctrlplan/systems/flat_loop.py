@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 
 from ctrlplan._checks import check_kind, check_signals, checked_vector, real_array
-from ctrlplan._display import Displayed, Facts, Part
+from ctrlplan._display import Displayed, Facts, Part, time_text
 from ctrlplan._types import Array, EventName, Params, Value
 from ctrlplan.flatness import DerivedFlatSystem, FlatSystem, flat_system
 from ctrlplan.systems.derived_laws import InputLimits, create_derived_law, input_bounds
@@ -56,7 +56,7 @@ class FlatLaw(Displayed):
     def create(self, flat: FlatSystem, plan: Trajectory, limits: InputLimits | None) -> ct.NonlinearIOSystem:
         """Block of the law, its extension at the start of the plan."""
         if isinstance(plan, PathPlan):
-            stops = ", ".join(f"{time:.6g} s" for time in plan.stops)
+            stops = ", ".join(f"{time_text(time)} s" for time in plan.stops)
             raise ValueError(
                 f"law must be a Feedforward or TVLQR for a PathPlan, got a FlatLaw: it computes inputs of {flat.name} "
                 f"from positions and their derivatives, which do not determine them at the stops, at {stops}"
@@ -310,7 +310,7 @@ def _check_no_step(plan: Trajectory, flat: FlatSystem) -> None:
     for jump in plan.jumps(0)[:1]:
         raise ValueError(
             f"plan must be continuous for a law of {flat.name}, got a step of {jump.label} by {jump.size:.4g} at "
-            f"{jump.time:g} s; give a plan at rest at the goal, and initial_state= from which it is approached"
+            f"{time_text(jump.time)} s; give a plan at rest at the goal, and initial_state= from which it is approached"
         )
 
 

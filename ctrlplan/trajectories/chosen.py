@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite, one_number
+from ctrlplan._display import time_text
 from ctrlplan.trajectories.combined import Joined
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.cycle import knots_of, moved
@@ -79,7 +80,7 @@ def _repeated_on_cycle(plan: Repeated, dt: float, limits: Mapping[str, object] |
     if plan.since != plan.start:
         raise ValueError(
             f"a plan must be put on the cycle before it repeats, got one that repeats from {plan.since:g} s on after "
-            f"its start at {plan.start:g} s"
+            f"its start at {time_text(plan.start)} s"
         )
     period = on_cycle(plan.plan, dt, limits)
     return plan if period is plan.plan else Repeated(period, plan.count)

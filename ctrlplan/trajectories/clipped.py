@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import check_kind, checked_finite
+from ctrlplan._display import time_text
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, mapped_time, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
@@ -61,8 +62,8 @@ class Clipped(Trajectory):
         first, last = checked_finite(start, "start"), checked_finite(end, "end")
         if not plan.start <= first < last <= plan.end:
             raise ValueError(
-                f"start and end must increase and lie within the plan, from {plan.start:g} s to {plan.end:g} s, got "
-                f"{first:g} s and {last:g} s"
+                f"start and end must increase and lie within the plan, from {time_text(plan.start)} s to "
+                f"{time_text(plan.end)} s, got {time_text(first)} s and {time_text(last)} s"
             )
         plan = covering(plan, last)
         inner = plan.breakpoints[(plan.breakpoints > first) & (plan.breakpoints < last)]

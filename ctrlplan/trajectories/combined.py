@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_finite, checked_labels, default_labels
-from ctrlplan._display import counted
+from ctrlplan._display import counted, time_text
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
@@ -453,7 +453,7 @@ def check_join(before: Trajectory, after: Trajectory) -> None:
     if np.any(first != last) and np.any(np.abs(first - last) > join_slack(before, after)):
         raise ValueError(
             f"positions must agree where trajectories join, got {first.tolist()} after {last.tolist()} "
-            f"at {before.end:g} s"
+            f"at {time_text(before.end)} s"
         )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite, checked_names, default_labels, real_array
+from ctrlplan._display import time_text
 from ctrlplan.trajectories.clipped import Clipped
 from ctrlplan.trajectories.combined import stack
 from ctrlplan.trajectories.common import FACTORIALS, Array
@@ -148,8 +149,8 @@ def _part(obj: object, known: tuple[float, float], start: float | None, end: flo
     last = known[1] if end is None or abs(end - known[1]) <= near else end
     if not known[0] <= first < last <= known[1]:
         raise ValueError(
-            f"start and end must increase and lie within the {type(obj).__name__}, from {known[0]:g} s to "
-            f"{known[1]:g} s, got {first:g} s and {last:g} s"
+            f"start and end must increase and lie within the {type(obj).__name__}, from {time_text(known[0])} s to "
+            f"{time_text(known[1])} s, got {time_text(first)} s and {time_text(last)} s"
         )
     return first, last
 

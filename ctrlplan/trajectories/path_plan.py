@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_count, checked_finite, checked_labels, checked_timepts, one_number
+from ctrlplan._display import time_text
 from ctrlplan._types import Data
 from ctrlplan.trajectories.clipped import Clipped
 from ctrlplan.trajectories.combined import Joined, check_join
@@ -297,7 +298,7 @@ class PathPlan(Joined):
         return [
             *known,
             ("segments", ", ".join(names[direction] for direction in self.directions)),
-            ("stops at", ", ".join(f"{time:.6g} s" for time in self.stops)),
+            ("stops at", ", ".join(f"{time_text(time)} s" for time in self.stops)),
         ]
 
     def _check_headings(self) -> None:
@@ -409,6 +410,8 @@ def _timed(
         if (moving := rates > _SMALL * own.peak(1)).any():
             end = int(moving.argmax())
             time = (own.start, own.end)[end]
-            raise ValueError(f"law[{k}] must be at rest at its ends, got the rate {rates[end]:.4g} at {time:.6g} s")
+            raise ValueError(
+                f"law[{k}] must be at rest at its ends, got the rate {rates[end]:.4g} at {time_text(time)} s"
+            )
         parts.append(part)
     return parts

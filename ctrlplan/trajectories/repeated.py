@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import check_kind, checked_finite, one_number
-from ctrlplan._display import number
+from ctrlplan._display import number, time_text
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.clipped import Clipped
 from ctrlplan.trajectories.combined import Joined, join_slack
@@ -98,7 +98,7 @@ class Repeated(Trajectory):
         check_kind(plan, "plan", Trajectory)
         check_end(plan)
         if not plan.duration:
-            raise ValueError(f"plan must have a duration to be repeated, got a step at {plan.start:g} s")
+            raise ValueError(f"plan must have a duration to be repeated, got a step at {time_text(plan.start)} s")
         begin = plan.start if since is None else checked_finite(since, "since")
         if begin not in plan.breakpoints[:-1]:
             raise ValueError(
@@ -234,7 +234,7 @@ class Repeated(Trajectory):
         if end - begin > _SEGMENTS:
             raise ValueError(
                 f"t0 and t1 must include at most {_SEGMENTS} breakpoints, got {end - begin} from {first:g} s to "
-                f"{last:g} s"
+                f"{time_text(last)} s"
             )
         return np.unique(self._times(np.arange(begin, end)))
 
@@ -425,7 +425,7 @@ def _common_period(periods: Sequence[float]) -> float:
         if not abs(period - first * float(ratio)) <= _SAME * period or common / ratio > _PASSES:
             raise ValueError(
                 f"periods of plans that repeat for all future times must have a common multiple of at most {_PASSES} "
-                f"periods, got {first:.9g} s and {period:.9g} s; repeat one of them a number of times"
+                f"periods, got {time_text(first)} s and {period:.9g} s; repeat one of them a number of times"
             )
     return first * float(common)
 

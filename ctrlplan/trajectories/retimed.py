@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_labels
+from ctrlplan._display import time_text
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.combined import is_shaped, is_unit_rate
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
@@ -212,17 +213,19 @@ def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
     if isinstance(law, TimeLaw) and not is_shaped(plan):  # continuous and increasing
         return values
     for jump in law.jumps(0):
-        raise ValueError(f"law must be continuous, got a jump by {jump.size:g} at {jump.time:g} s")
+        raise ValueError(f"law must be continuous, got a jump by {jump.size:g} at {time_text(jump.time)} s")
     rate = law.extrema(1)
     if rate.minimum[0] < -_ROUNDING * rate.maximum[0]:
-        raise ValueError(f"law must increase, got the rate {rate.minimum[0]:g} at {rate.time_min[0]:g} s")
+        raise ValueError(f"law must increase, got the rate {rate.minimum[0]:g} at {time_text(rate.time_min[0])} s")
     if is_shaped(plan) and not (is_unit_rate(float(rate.minimum[0])) and is_unit_rate(float(rate.maximum[0]))):
         raise ValueError(
             f"law must have the rate 1 where the plan is shaped, got {rate.minimum[0]:g} to {rate.maximum[0]:g}: the "
             f"delays of the shaper would change with it; retime the plan before it is shaped, then shape the result"
         )
     for segment in np.flatnonzero(np.diff(values) <= 0.0).tolist():
-        raise ValueError(f"law must increase strictly, got {values[segment]:g} from {law.breakpoints[segment]:g} s on")
+        raise ValueError(
+            f"law must increase strictly, got {values[segment]:g} from {time_text(law.breakpoints[segment])} s on"
+        )
     return values
 
 

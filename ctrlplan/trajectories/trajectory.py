@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import MAXIMUM, checked_count, checked_finite, checked_number, checked_timepts, one_number
-from ctrlplan._display import MISSING, Displayed, Facts, Figure, Part, Table, number
+from ctrlplan._display import MISSING, Displayed, Facts, Figure, Part, Table, number, time_text
 from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories import extrema as _extrema
@@ -1000,8 +1000,8 @@ class Trajectory(Displayed, Fields, ABC):
 
     def _describe(self) -> Iterator[Part]:
         axes = ", ".join(self.labels)
-        until = f"to {self.end:g} s" if math.isfinite(self.end) else "on"
-        when = f"from {self.start:g} s {until}" if self.duration else f"at {self.start:g} s"
+        until = f"to {time_text(self.end)} s" if math.isfinite(self.end) else "on"
+        when = f"from {time_text(self.start)} s {until}" if self.duration else f"at {time_text(self.start)} s"
         yield f"{type(self).__name__} of {axes} {when}"
         yield Facts(self._facts())
         if self.waypoints:
@@ -1019,7 +1019,7 @@ class Trajectory(Displayed, Fields, ABC):
         """Values that a description states, by name; kinds add their own."""
         with np.errstate(over="ignore", invalid="ignore"):
             jumps = self.jumps(0) if self._has_quick_peaks() else ()
-        times = list(dict.fromkeys(f"{jump.time:.6g} s" for jump in jumps))
+        times = list(dict.fromkeys(f"{time_text(jump.time)} s" for jump in jumps))
         return [
             ("duration", f"{self.duration:.6g} s" if 0.0 < self.duration < math.inf else ""),
             ("segments", f"{self.breakpoints.size - 1}" if self.breakpoints.size > 2 else ""),
@@ -1049,7 +1049,7 @@ class Trajectory(Displayed, Fields, ABC):
         """Two times in order, each of which may be infinite."""
         first, last = checked_number(t0, "t0"), checked_number(t1, "t1")
         if last < first:
-            raise ValueError(f"t1 must not be below t0, got {last:g} s after {first:g} s")
+            raise ValueError(f"t1 must not be below t0, got {time_text(last)} s after {time_text(first)} s")
         return first, last
 
     def _marked_times(self) -> Array:

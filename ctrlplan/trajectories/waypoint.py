@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_finite, default_labels, new_numbers
-from ctrlplan._display import Displayed, Part, Table, counted, number, shortened
+from ctrlplan._display import Displayed, Part, Table, counted, number, shortened, time_text
 from ctrlplan._types import Data
 from ctrlplan.trajectories.common import Array, readonly, times_powers
 from ctrlplan.trajectories.fields import Fields
@@ -249,7 +249,7 @@ class Waypoint(Displayed, Fields):
         return f"Waypoint({self.time!r}, {named})"
 
     def _describe(self) -> Iterator[Part]:
-        yield f"Waypoint at {self.time:.6g} s"
+        yield f"Waypoint at {time_text(self.time)} s"
         rows = [[entry_name(k), *map(_prescribed, row)] for k, row in enumerate(self.jet.tolist())]
         yield Table("Prescribed values", ("", *(self.labels or default_labels(self.naxes))), rows)
 
@@ -369,7 +369,7 @@ def waypoint_table(waypoints: Sequence[Waypoint], labels: Sequence[str]) -> Tabl
         for jet in point.jet.T.tolist():
             given = max((k + 1 for k, value in enumerate(jet) if value == value), default=1)
             cells.append(", ".join(map(_prescribed, jet[:given])))
-        rows.append([f"{point.time:.6g}", *cells])
+        rows.append([time_text(point.time), *cells])
     names = ", ".join(map(entry_name, range(count)))
     return Table(f"{counted(len(waypoints), 'waypoint')}: {names}", ("time [s]", *labels), shortened(rows))
 
