@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, NoReturn, get_args
 
@@ -25,6 +25,7 @@ from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
 from ctrlplan.planning.path_law import FastLaw, Rates, fastest_law, fastest_smooth_law
 from ctrlplan.planning.path_law.positions import required_rate
 from ctrlplan.planning.path_law.signals import HIGHEST, fast_laws_of_signals, law_with_given_ends
+from ctrlplan.planning.path_law.stopping import stopping
 from ctrlplan.planning.path_law.vehicle import fastest_segment_law, orders_on_path
 from ctrlplan.planning.peaks import excess_at_peaks
 from ctrlplan.planning.quantities import System, shapes_given, system_given
@@ -252,8 +253,10 @@ def fastest(
         closed and in motion at its ends remains closed. Limits over time (`Limits`
         with during, along or functions) apply at the positions of the given plan at
         these times. Stops and dwells remain, dwells with
-        their duration. If accelerations are limited, the plan stops at corners of
-        the path. The segments of a `PathPlan` get a time law each.
+        their duration. If accelerations, jerks or quantities that depend on them are
+        limited, the plan stops at corners of the path, a cyclic plan also at one
+        between its end and its start. The segments of a `PathPlan` get a time law
+        each.
     durations : (float, float), optional
         Interval of durations [s] of the search. Default: from 1/64 of the minimum
         that was found (of the plan's duration for "waypoints") to 64 times the
@@ -431,16 +434,42 @@ def _fastest(
     if hold == "waypoints":
         return _searched(ReplannedPlans(plan, limited), span, hold, endless=False)
     if hold == "path":
-        stops = isinstance(plan, PathPlan)  # at rest at its ends as well
-        signed = any(_is_signed(bound) for bound in limited.bounds)
-        if not (stops or signed) and limited.derivatives_only and limited.order <= 3:
-            return _fastest_on_path(plan, limited, span, ends)
+        return _fastest_on_path(plan, limited, span, ends)
+    return fastest_within(plan, limited, span)
+
+
+def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, float] | None, ends: Ends) -> Fastest:
+    """Plan of minimum duration on its path."""
+    signed = any(_is_signed(bound) for bound in limited.bounds)
+    if isinstance(plan, PathPlan):  # at rest at its ends as well
         limited.check_constant('limits with hold="path"')
         limited.check_smooth(plan)
-        if isinstance(plan, PathPlan):
-            return _fastest_between_stops(plan, limited, span)
-        return (_with_given_speeds if ends == "given" else _fastest_by_signals)(plan, limited, span)
-    return fastest_within(plan, limited, span)
+        return _fastest_between_stops(plan, limited, span)
+    by_derivatives = limited.derivatives_only and limited.order <= 3 and not signed
+    limited.check_constant('limits with hold="path"', over_time=by_derivatives)
+    if by_derivatives and limited.order <= 2:
+        return _fastest_by_derivatives(plan, limited, span, ends)
+    own, corners = _with_smooth_stops(plan, limited, lap=ends == "free")
+    if by_derivatives:
+        found = _fastest_by_derivatives(own, limited, span, ends)
+    else:
+        found = (_with_given_speeds if ends == "given" else _fastest_by_signals)(own, limited, span)
+    return replace(found, stops=corners)
+
+
+def _with_smooth_stops(plan: Trajectory, limited: Limited, lap: bool) -> tuple[Trajectory, tuple[float, ...]]:
+    """Plan whose limited signals are finite where the path requires a stop, and the times of its corners."""
+    try:
+        limited.check_smooth(plan)
+    except ValueError:
+        if plan.jumps(0) or not limited.is_constant:
+            raise
+        own, corners = stopping(plan, limited.order, lap)
+        with suppress(ValueError):
+            limited.check_smooth(own)
+            return own, corners
+        raise
+    return plan, ()
 
 
 def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, float] | None) -> Fastest:
@@ -487,9 +516,12 @@ def _with_given_speeds(plan: Trajectory, limited: Limited, span: tuple[float, fl
         )
     _check_rest(plan, limited)
     _check_signs(plan, limited, given=True)
-    found, margins = _with_reserves(
-        plan, limited, span, partial(law_with_given_ends, plan.shift(-plan.start), limited, plan.start)
-    )
+    begun = plan.shift(-plan.start)  # the values of the time law are times
+
+    def law(reserve: float) -> Trajectory:
+        return law_with_given_ends(begun, limited, plan.start, reserve).shift(plan.start)
+
+    found, margins = _with_reserves(plan, limited, span, law)
     return Fastest(found, margins, ((found.duration, found.duration),), "path", limited, statement=_LOCAL)
 
 
@@ -612,15 +644,15 @@ def _fastest_in_loop(
     return Fastest(found, margins, feasible, "shape", limited, "", searched, statement)
 
 
-def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, float] | None, ends: Ends) -> Fastest:
+def _fastest_by_derivatives(
+    plan: Trajectory, limited: Limited, span: tuple[float, float] | None, ends: Ends
+) -> Fastest:
     """Plan of minimum duration on its path, under limits of velocities, accelerations and jerks."""
     limited.check_constant('limits with hold="path"', over_time=True)
     for jump in plan.jumps(0):
         raise ValueError(
             f"plan must be continuous, got {jump.label} that jumps by {jump.size:.4g} at {time_text(jump.time)} s"
         )
-    if limited.order == 3:
-        limited.check_smooth(plan)
     if not limited.order:
         raise ValueError("limits must include one that a shorter plan would violate, got none")
     _check_rest(plan, limited)
@@ -706,7 +738,7 @@ def _with_given_ends(
     def law(reserve: float) -> Trajectory:
         found, _ = _law_under_narrow_limits(plan, limited, (1.0, 1.0), reserve)
         stops.append(found.stops)
-        return found.plan.shift(-plan.start)
+        return found.plan
 
     return *_with_reserves(plan, limited, span, law), stops[-1]
 
@@ -719,8 +751,8 @@ def _with_reserves(
 ) -> tuple[Trajectory, Margins]:
     """Plan with given speeds at its ends, with which it cannot be retimed, and its margins.
 
-    A plan with a distance from the limits, relative to them, is begun at time 0; the
-    smallest distance is taken with which the limits are satisfied.
+    `law_with_reserve` returns a plan with a distance from the limits, relative to
+    them; the smallest distance is taken with which the limits are satisfied.
     """
     if span is not None:
         raise ValueError(
@@ -729,7 +761,7 @@ def _with_reserves(
         )
     _check_given_speeds(plan, limited)
     for reserve in _RESERVES:
-        found = law_with_reserve(reserve).shift(plan.start)
+        found = law_with_reserve(reserve)
         margins = limited.margins(found)
         if margins.active.fraction >= -_AT_ENDS:
             return found, margins
@@ -764,7 +796,9 @@ def _law_on_path(
     begun = plan.shift(-plan.start) if plan.start else plan
     fast_law = fastest_smooth_law if limited.order == 3 else fastest_law
     found = fast_law(begun, limited.bounds, plan.start, given, reserve, narrow)
-    return replace(found, plan=found.plan.shift(plan.start)) if plan.start else found
+    if not plan.start:
+        return found
+    return FastLaw(found.plan.shift(plan.start), tuple(plan.start + time for time in found.stops))
 
 
 def _check_signs(plan: Trajectory, limited: Limited, given: bool) -> None:

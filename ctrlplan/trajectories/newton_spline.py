@@ -107,6 +107,11 @@ class NewtonSpline(WaypointSpline):
         return plan
 
     @property
+    def is_cyclic(self) -> bool:
+        """Whether it was made by `cyclic`."""
+        return self._options.period is not None
+
+    @property
     def degree(self) -> tuple[int, ...]:
         """Degree of each axis: m, or that of the polynomial if alpha is 0."""
         return tuple(s.size // 2 if self.alpha else s.size - 1 for s, _ in self._per_axis())

@@ -282,6 +282,11 @@ class PiecewiseSpline(WaypointSpline):
             _pieces=pieces,
         )
 
+    @property
+    def is_cyclic(self) -> bool:
+        """Whether it was made by `cyclic`."""
+        return self._period is not None
+
     @cached_property
     def waypoints(self) -> tuple[Waypoint, ...]:  # type: ignore[override]  # a field of the base class
         """Prescribed positions and derivatives."""

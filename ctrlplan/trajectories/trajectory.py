@@ -291,6 +291,11 @@ class Trajectory(Displayed, Fields, ABC):
         return self.end - self.start
 
     @property
+    def is_cyclic(self) -> bool:
+        """Whether it is one period, made by `cyclic` of a spline."""
+        return False
+
+    @property
     def naxes(self) -> int:
         """Number of axes."""
         return len(self.labels)

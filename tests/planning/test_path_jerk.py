@@ -155,13 +155,75 @@ def test_stops_and_dwells_remain():
 @pytest.mark.parametrize(
     ("plan", "message"),
     [
-        (PolySpline([Waypoint(0, 0, 0), Waypoint(1, 1, 0)]), "limits of y_d3 require a plan that is continuous up to"),
+        (
+            PiecewiseSpline([Waypoint(0, 0), Waypoint(1, 1), Waypoint(2, 3)]),
+            "limits of y_d3 require a plan that is continuous up to",
+        ),
         (PolySpline([Waypoint(0, 0, 1, 0), Waypoint(1, 1, 1, 0)]), "limits must bound the speed along the whole path"),
     ],
 )
 def test_plans_and_limits_that_are_rejected(plan, message):
     with pytest.raises(ValueError, match=message):
         fastest(plan, {"jerk": 10.0}, hold="path")
+
+
+def one_metre(jerk):
+    """Minimum time from rest to rest with an acceleration of at most 1 m/s^2."""
+    if jerk**2 >= 2.0:
+        return 1 / jerk + np.sqrt(1 / jerk**2 + 4.0)
+    return 4.0 * (1 / (2 * jerk)) ** (1 / 3)
+
+
+CORNERS = ([0, 0], [1, 0], [1, 1], [0, 1])
+
+
+def polyline(*entries, dwell=0.0):
+    """Three sides of a square, with the same entries at all waypoints, and a dwell after the first side."""
+    points = [Waypoint(k + (dwell if k > 1 else 0.0), corner, *entries) for k, corner in enumerate(CORNERS)]
+    if dwell:
+        points.insert(2, Waypoint(1 + dwell, CORNERS[1], *entries))
+    return PiecewiseSpline(points)
+
+
+@pytest.mark.parametrize("jerk", [0.8, 5.0, 200.0])
+@pytest.mark.parametrize("entries", [(0,), (0, 0), (0, 0, 0)])
+@pytest.mark.parametrize("start", [0.0, -3.0, 1e9])
+def test_from_stop_to_stop_whatever_the_time_law_of_the_plan_is_there(jerk, entries, start):
+    """Its acceleration may jump at its stops, where another time law is at rest anyway."""
+    plan = polyline(*entries, dwell=0.75).shift(start)
+    found = fastest(plan, limits_of(50, 1, jerk), hold="path")
+    best = 0.75 + 3 * one_metre(jerk)
+    assert best * (1 - 1e-6) <= found.duration <= 1.01 * best
+    check_limits(found.plan, limits_of(50, 1, jerk))
+    assert found.margins.satisfied
+    assert found.plan.start == start
+
+
+@pytest.mark.parametrize("start", [0.0, 7.5])
+@pytest.mark.parametrize(("kind", "ends"), [("derivatives", "free"), ("derivatives", "given"), ("quantities", "free")])
+def test_the_plan_stops_at_corners_and_says_so(kind, start, ends):
+    """With free ends from any speed, braked with -1 m/s^2 and at the end with the jerk; then from stop to stop.
+
+    From the end of the side, with r = 1/j the time of that jerk: j r^3/6 + (r/2) x + x^2/2 = 1 m after r + x.
+    """
+    plan, jerk = polyline(dwell=0.75).shift(start), 5.0
+    limits, system = limits_of(50, 1, jerk), None
+    if kind == "quantities":
+        limits = {"velocity": 50.0, "push": cp.Limits(-2.0, 2.0, rate=10.0), "pull": cp.Limits(-1.0, 1.0, rate=5.0)}
+        system = lambda jet: {"push": 2.0 * jet[2, 0], "pull": jet[2, 1]}  # noqa: E731
+    found = fastest(plan, limits, system, hold="path", ends=ends)
+    r = 1.0 / jerk
+    x = -r / 2 + np.sqrt(r**2 / 4 + 2.0 * (1.0 - jerk * r**3 / 6))
+    best = 2 * (r + x) + 0.75 + one_metre(jerk)
+    assert found.stops == (start + 1.0, start + 1.75, start + 2.75)
+    assert "stops at corners of the path" in " ".join(str(found).split())
+    if ends == "free":
+        assert best * (1 - 1e-6) <= found.duration <= 1.01 * best
+    else:
+        assert best < found.duration
+        assert found.plan.jet(start, 1)[1].ravel() == pytest.approx([1.0, 0.0], rel=1e-12)
+    check_limits(found.plan, limits_of(50, 1, jerk))
+    assert {jump.time for jump in found.plan.jumps(2)} <= {start, found.plan.end}
 
 
 def test_the_plan_is_saved_with_its_law(tmp_path):

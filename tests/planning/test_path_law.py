@@ -208,6 +208,26 @@ def test_the_plan_stops_at_corners_of_the_path_and_says_so():
     assert {jump.time for jump in found.plan.jumps(1)} <= {found.plan.start, found.plan.end}
 
 
+@pytest.mark.parametrize("start", [0.0, 2.5])
+@pytest.mark.parametrize("limits", [{}, {"jerk": 1e3}, {"both": 1e3}])
+def test_a_cyclic_polygon_stops_at_its_first_corner_too(start, limits):
+    """A square from stop to stop, four times 2 sqrt(1 / 1); the ends of a plan that is not cyclic are free."""
+    corners = [Waypoint(start + k, corner) for k, corner in enumerate([[0, 0], [1, 0], [1, 1], [0, 1]])]
+    plan = PiecewiseSpline.cyclic(corners, 4.0)
+    system = (lambda jet: {"both": jet[1, 0] + jet[2, 1]}) if "both" in limits else None
+    found = fastest(plan, {"velocity": 10.0, "acceleration": 1.0} | limits, system, hold="path")
+    assert 8.0 <= found.duration <= 8.05
+    assert found.stops == tuple(start + np.arange(5.0))
+    lap = found.plan.repeat(2)
+    assert not lap.jumps(1)
+    check_limits(lap, {"velocity": 10.0, "acceleration": 1.0})
+    free = fastest(
+        PiecewiseSpline([*corners, Waypoint(start + 4, [0, 0])]), {"velocity": 10.0, "acceleration": 1.0}, hold="path"
+    )
+    assert free.duration == pytest.approx(4.0 + 2.0 * math.sqrt(2.0), rel=3e-3)
+    assert free.stops == tuple(start + np.arange(1.0, 4.0))
+
+
 def test_a_corner_is_passed_if_accelerations_are_not_limited():
     plan = PiecewiseSpline([Waypoint(0, [0, 0]), Waypoint(1, [3, 0]), Waypoint(2, [3, 4])])
     found = fastest(plan, {"velocity": 2.0}, hold="path")

@@ -163,8 +163,8 @@ class _Search:
     def _raise_infeasible(self) -> NoReturn:
         if self._fixed.any():
             raise ValueError(
-                "limits must be satisfied with the speeds at the ends of the plan and at corners, got no time law that "
-                "does; lower these speeds, raise the limits, or choose free ends"
+                "limits must be satisfied with the speeds at the ends of the plan and at corners, but no such time law "
+                "is found; lower these speeds, raise the limits, or choose free ends"
             )
         raise ValueError(
             "limits must be satisfied by some time law on the path, got none that does; raise the limits, or use "

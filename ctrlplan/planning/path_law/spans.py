@@ -109,18 +109,21 @@ def parts_of(
     origin : float, optional
         Start [s] of the plan before it was moved to 0, of which its times have the rounding.
     """
-    spans, joints = _spans(plan, stops, edges, origin)
+    spans, joints = spans_of(plan, stops, edges, origin)
+    free = spans[0].moves and spans[-1].moves and given == (None, None)
+    closing = closing_joint(plan) if free else None
+    if closing is not None and closing.stops:
+        given = (0.0, 0.0) if closing.corner and stops and plan.is_cyclic else given
+        closing = None
     ends = [0, *(k + 1 for k, joint in enumerate(joints) if joint.stops), len(spans)]
     parts = []
     for first, last in pairwise(ends):
-        inner = [*joints[first : last - 1], _Joint(True, False)]
+        inner = [*joints[first : last - 1], Joint(True, False)]
         start = given[0] if first == 0 else 0.0 if joints[first - 1].corner else None
         stop = given[1] if last == len(spans) else 0.0 if joints[last - 1].corner else None
         rates = None if spans[first].rests[0] else start, None if spans[last - 1].rests[1] else stop
         ratios, bends = tuple(joint.ratio for joint in inner), tuple(joint.bend for joint in inner)
         parts.append(Part(tuple(spans[first:last]), ratios, bends, rates))
-    free = spans[0].moves and spans[-1].moves and given == (None, None)
-    closing = _closing(plan) if free else None
     if closing is None:
         return parts
     begin, end = parts[0], parts[-1]
@@ -138,7 +141,7 @@ def parts_of(
 
 
 @dataclass(frozen=True)
-class _Joint:
+class Joint:
     """Point between two spans.
 
     Attributes
@@ -159,25 +162,25 @@ class _Joint:
     bend: float = 0.0
 
 
-def _joint(before: Array, after: Array, still: Array, stops: bool = True) -> _Joint:
+def _joint(before: Array, after: Array, still: Array, stops: bool = True) -> Joint:
     """Kind of a point, by the jets (3, naxes) on both sides, and velocities and accelerations that are 0."""
     rests = [bool((np.abs(jet[1]) <= still[0]).all()) for jet in (before, after)]
     if all(rests):
         # A reversal with acceleration is passed without a break.
         passes = (np.abs(after[2] - before[2]) <= 1e3 * still[1]).all() and (np.abs(after[2]) > 1e3 * still[1]).any()
-        return _Joint(not passes, False)
+        return Joint(not passes, False)
     moving = still[0] > 0.0
     tangents = [jet[1, moving] / still[0, moving] for jet in (before, after)]
     sizes = [float(np.linalg.norm(tangent)) for tangent in tangents]
     if any(rests) or (np.abs(tangents[0] / sizes[0] - tangents[1] / sizes[1]) > 1e-7).any():
-        return _Joint(stops, stops)
+        return Joint(stops, stops)
     ratio = sizes[0] / sizes[1] if abs(sizes[0] / sizes[1] - 1.0) > 1e-12 else 1.0
     jump = (ratio**2 * after[2, moving] - before[2, moving]) / still[0, moving]
     bend = float(jump @ tangents[0]) / sizes[0] ** 2
-    return _Joint(False, False, ratio, bend)
+    return Joint(False, False, ratio, bend)
 
 
-def _spans(plan: Trajectory, stops: bool, edges: Sequence[float], origin: float) -> tuple[list[Span], list[_Joint]]:
+def spans_of(plan: Trajectory, stops: bool, edges: Sequence[float], origin: float) -> tuple[list[Span], list[Joint]]:
     """Spans between breakpoints and waypoints, and the points between them."""
     segments, starts, ends = [], [], []
     inner = np.unique([*(waypoint.time for waypoint in plan.waypoints), *edges])
@@ -206,7 +209,7 @@ def _spans(plan: Trajectory, stops: bool, edges: Sequence[float], origin: float)
     joints = [
         _joint(jets[:, :, k, -1], jets[:, :, k + 1, 0], still, stops)
         if spans[k].moves and spans[k + 1].moves
-        else _Joint(True, stops)
+        else Joint(True, stops)
         for k in range(len(spans) - 1)
     ]
     return spans, joints
@@ -221,12 +224,12 @@ def _powers(velocities: Array) -> list[list[float]]:
     return np.where(rests & np.isfinite(powers), np.clip(powers, 1.0, None), 0.0).tolist()
 
 
-def _closing(plan: Trajectory) -> _Joint | None:
-    """Joint of the end of a closed plan with its start, if it is in motion or accelerated there; otherwise None."""
+def closing_joint(plan: Trajectory) -> Joint | None:
+    """Joint of the end of a closed plan with its start; None if it is not closed, or its speed is not the same."""
     first, last = plan.jet(plan.start, 2), plan.jet(plan.end, 2, left=True)
     extrema = plan.extrema()
     slack = 1e-9 * (extrema.maximum - extrema.minimum) + 1e-14 * np.abs(first[0])
     if (np.abs(last[0] - first[0]) > slack).any():
         return None
     joint = _joint(last, first, _STILL * np.stack([plan.peak(1), plan.peak(2)]))
-    return None if joint.stops or abs(joint.ratio - 1.0) > 1e-7 else joint
+    return joint if abs(joint.ratio - 1.0) <= 1e-7 else None
