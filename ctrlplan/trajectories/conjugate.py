@@ -574,7 +574,7 @@ class _Banded:
         if not info:
             # Solutions for some right sides of size 1 bound the inverse from below, and nearly reach it.
             with np.errstate(all="ignore"):
-                largest = float(np.abs(self.solve(_signs(n).copy())).max(initial=0.0))
+                largest = float(np.abs(self.solve(_right_sides(n).copy())).max(initial=0.0))
             self.condition = norm * largest if np.isfinite(largest) else np.inf
         self.loss = float(np.finfo(float).eps) * self.condition * amplification
 
@@ -585,9 +585,16 @@ class _Banded:
 
 
 @lru_cache(maxsize=8)
-def _signs(n: int) -> Array:
-    """Random right sides from which the condition number is estimated."""
-    return readonly(np.random.default_rng(0).choice([-1.0, 1.0], (n, _RIGHT_SIDES)).T.copy())
+def _right_sides(n: int) -> Array:
+    """Random right sides of size 1 from which the condition number is estimated.
+
+    Of different magnitudes: the signs alone are orthogonal to simple combinations of rows, with which a singular
+    matrix is not found.
+    """
+    random = np.random.default_rng(0)
+    return readonly(
+        (random.choice([-1.0, 1.0], (n, _RIGHT_SIDES)) * random.uniform(0.5, 1.0, (n, _RIGHT_SIDES))).T.copy()
+    )
 
 
 @lru_cache(maxsize=256)

@@ -24,6 +24,9 @@ from ctrlplan.trajectories.digits import basis_series
 
 Ends = tuple[tuple[int, ...], tuple[int, ...]]
 """Orders of the derivatives that determine a segment, at its start and at its end."""
+_LOST = 15
+"""Number of digits that elimination may lose where the equations are singular; 40 more are used than the times require."""
+
 _Row = tuple[dict[int, Decimal], list[Decimal]]
 """An equation: its coefficients by unknown, and its right sides."""
 
@@ -60,7 +63,8 @@ def conjugate_digits(
         steps = [Decimal(h.numerator) / Decimal(h.denominator) for h in durations]
         place = {entry: n for n, entry in enumerate(free)}
         weights = [_derivatives(alpha, pair, size, digits) for pair in ends]
-        solution = _solved([_jump(entry, place, steps, weights, ends, table) for entry in free])
+        equations = [_jump(entry, place, steps, weights, ends, table) for entry in free]
+        solution = _solved(equations, rounding=Decimal(10) ** (_LOST - digits))
     return None if solution is None else np.array(solution, dtype=object)
 
 
@@ -100,7 +104,7 @@ def _derivatives(alpha: float, ends: Ends, size: int, digits: int) -> list[list[
         for end, k in [(side, k) for side in (0, 1) for k in ends[side]]:
             unit = [Decimal(int(n == len(rows))) for n in range(len(nodes))]
             rows.append((dict(enumerate(values[end][k])), unit))
-        inverse = _solved(rows)
+        inverse = _solved(rows, rounding=Decimal(0))
         if inverse is None:
             raise ValueError("the entries prescribed at the ends of a segment must determine it, got a singular system")
         columns = list(zip(*inverse, strict=True))
@@ -109,8 +113,8 @@ def _derivatives(alpha: float, ends: Ends, size: int, digits: int) -> list[list[
         ]
 
 
-def _solved(rows: list[_Row]) -> list[list[Decimal]] | None:
-    """Solution by Gaussian elimination with pivoting; None if the equations are singular."""
+def _solved(rows: list[_Row], rounding: Decimal) -> list[list[Decimal]] | None:
+    """Solution by Gaussian elimination with pivoting; None if a pivot is 0 or rounding: the equations are singular."""
     left = []
     for coefficients, right in rows:
         size = max(map(abs, coefficients.values()), default=Decimal(0)) or Decimal(1)
@@ -125,6 +129,8 @@ def _solved(rows: list[_Row]) -> list[list[Decimal]] | None:
             return None
         chosen = max(held, key=lambda m: abs(left[m][0][n]))
         pivot, right = left[chosen]
+        if abs(pivot[n]) <= rounding:
+            return None
         for m in held:
             coefficients, other = left[m]
             if m != chosen:
