@@ -826,14 +826,15 @@ class Limited:
                 f"limits of {bound.name} must apply after the start of the plan at {self._start:.10g} s, got an "
                 f"interval from {first:.10g} to {last:.10g} s; give times of the plan"
             )
+        if bound.interval is not None and not bound.in_loop:
+            first, last = bound.interval
+            if last <= self._start or first >= self._start + self._duration:
+                what = "during" if bound.profile is None else "along"
+                raise ValueError(
+                    f"{what} of {bound.name} must overlap the plan, from {time_text(self._start)} to "
+                    f"{time_text(self._start + self._duration)} s, got {time_text(first)} to {time_text(last)} s"
+                )
         if bound.profile is None:
-            if bound.interval is not None and not bound.in_loop:
-                first, last = bound.interval
-                if last <= self._start or first >= self._start + self._duration:
-                    raise ValueError(
-                        f"during of {bound.name} must overlap the plan, from {self._start:g} to "
-                        f"{time_text(self._start + self._duration)} s, got {time_text(first)} to {time_text(last)} s"
-                    )
             return bound
         if bound.in_loop and not bound.profile.times:
             raise ValueError(

@@ -55,6 +55,14 @@ def derivative_scale(duration: float, order: int) -> Array:
     return scale
 
 
+def by_orders(values: Array, scale: Array) -> Array:
+    """Taylor coefficients times factors by order, of which some may be infinite: exact zeros remain."""
+    if math.isfinite(float(scale.max())):
+        return values * scale
+    with np.errstate(invalid="ignore"):
+        return np.where(values == 0.0, 0.0, values * scale)
+
+
 def scales_of_orders(duration: float | Array, low: int, high: int) -> Array:
     """Factors (..., norders, 1, 1) from Taylor coefficients in normalised time to derivatives low to high."""
     return FACTORIALS[low : high + 1, None, None] * duration ** _exponents(low, high)

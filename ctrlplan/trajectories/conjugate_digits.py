@@ -25,7 +25,7 @@ from ctrlplan.trajectories.digits import basis_series
 Ends = tuple[tuple[int, ...], tuple[int, ...]]
 """Orders of the derivatives that determine a segment, at its start and at its end."""
 _LOST = 15
-"""Number of digits that elimination may lose where the equations are singular; 40 more are used than the times require."""
+"""Digits that elimination may lose where the equations are singular; 40 more are used than the times require."""
 
 _Row = tuple[dict[int, Decimal], list[Decimal]]
 """An equation: its coefficients by unknown, and its right sides."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import lru_cache
+from threading import RLock
 from typing import TYPE_CHECKING, NoReturn
 from weakref import finalize
 
@@ -94,12 +96,15 @@ class _Known:
         Orders and segments whose candidates need no Newton step.
     together : dict
         Segments and candidates in them by order, of all segments, relative as well.
+    lock : context manager
+        Held by the thread that searches extrema of the plan.
     """
 
     extrema: dict[int, Extrema] = field(default_factory=dict)
     places: dict[tuple[int, int], Array] = field(default_factory=dict)
     exact: set[tuple[int, int]] = field(default_factory=set)
     together: dict[int, Places] = field(default_factory=dict)
+    lock: AbstractContextManager[object] = field(default_factory=RLock)
 
 
 _KNOWN: dict[int, _Known] = {}
@@ -138,10 +143,12 @@ def keep_places(plan: Trajectory, moved: Trajectory, times: Array, moved_times: 
 
 def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     """Extrema of the nu-th derivative, axis by axis; computed once for a plan, returned as the caller's own."""
-    known = _known(plan).extrema
-    if nu not in known:
-        known[nu] = _derivative_extrema(plan, nu)
-    own = known[nu]
+    known = _known(plan)
+    if nu not in known.extrema:
+        with known.lock:  # places that another thread has just found would be taken for those of a similar plan
+            if nu not in known.extrema:
+                known.extrema[nu] = _derivative_extrema(plan, nu)
+    own = known.extrema[nu]
     return Extrema(own.minimum.copy(), own.maximum.copy(), own.time_min.copy(), own.time_max.copy())
 
 
@@ -167,18 +174,19 @@ def search_extrema(plan: Trajectory, orders: Iterable[int]) -> None:
 
     All of them are evaluated at the stationary points of each.
     """
-    known = _known(plan).extrema
-    missing = [nu for nu in orders if nu and nu not in known]
-    places = [] if plan.in_batches else [_stationary_places(plan, nu) for nu in missing]
-    found = [own for own in places if own is not None]
-    if missing and len(found) == len(missing):
-        segments, s = (np.concatenate(rows) for rows in zip(*found, strict=True))
-        values = _Candidates()
-        _add_at_places(plan, missing, (segments, s), values)
-        both = values.extrema()
-        columns = (both.minimum, both.maximum, both.time_min, both.time_max)
-        for nu, *rows in zip(missing, *(column.reshape(len(missing), -1) for column in columns), strict=True):
-            known[nu] = Extrema(*rows)
+    known = _known(plan)
+    with known.lock:
+        missing = [nu for nu in orders if nu and nu not in known.extrema]
+        places = [] if plan.in_batches else [_stationary_places(plan, nu) for nu in missing]
+        found = [own for own in places if own is not None]
+        if missing and len(found) == len(missing):
+            segments, s = (np.concatenate(rows) for rows in zip(*found, strict=True))
+            values = _Candidates()
+            _add_at_places(plan, missing, (segments, s), values)
+            both = values.extrema()
+            columns = (both.minimum, both.maximum, both.time_min, both.time_max)
+            for nu, *rows in zip(missing, *(column.reshape(len(missing), -1) for column in columns), strict=True):
+                known.extrema[nu] = Extrema(*rows)
 
 
 def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:

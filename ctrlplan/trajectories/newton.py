@@ -1108,11 +1108,12 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: in
         size_of = np.abs(rest).max(axis=0)
         weight = 1.0 / np.where(size_of > 0.0, size_of, 1.0)
         scaled = rest * weight
-        singular = np.linalg.svd(scaled / np.linalg.norm(scaled, axis=1, keepdims=True), compute_uv=False)
-        if singular[-1] < 1e-13 * singular[0]:
+        lengths = np.linalg.norm(scaled, axis=1, keepdims=True)
+        singular = np.linalg.svd(scaled / np.where(lengths > 0.0, lengths, 1.0), compute_uv=False)
+        if not singular[-1] > 1e-13 * singular[0]:
             raise ValueError(
                 "free entries must not make the system singular: the prescribed entries conflict or leave "
-                f"the plan undetermined, got a relative singular value of {singular[-1] / singular[0]:.1g}"
+                f"the plan undetermined, got a relative singular value of {singular[-1] / (singular[0] or 1.0):.1g}"
             )
         mixed, upper = np.linalg.qr(scaled.T, mode="complete")
         basis = np.eye(size)

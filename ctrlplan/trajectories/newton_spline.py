@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from ctrlplan._checks import checked_count, checked_labels
 from ctrlplan._display import number
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.common import Array, are_finite, derivative_scale, mapped_time, readonly, scales_of_orders
+from ctrlplan.trajectories.common import (
+    Array,
+    are_finite,
+    by_orders,
+    derivative_scale,
+    mapped_time,
+    readonly,
+    scales_of_orders,
+)
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, shared_system
 from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
@@ -255,7 +263,7 @@ class NewtonSpline(WaypointSpline):
         for axes, system, coefficients in self._parts:
             taylor = system.taylor(u, order)
             values = coefficients.T @ taylor.reshape(system.size, -1)
-            values = values.reshape(len(axes), order + 1, u.size).transpose(1, 0, 2) * scale[:, None, None]
+            values = by_orders(values.reshape(len(axes), order + 1, u.size).transpose(1, 0, 2), scale[:, None, None])
             if len(axes) == self.naxes:
                 return values
             out[:, list(axes)] = values

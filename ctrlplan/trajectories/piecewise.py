@@ -15,7 +15,15 @@ from ctrlplan._display import number
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.chosen import checked_alpha, chosen_alpha
-from ctrlplan.trajectories.common import Array, are_finite, derivative_scale, mapped_time, readonly, scales_of_orders
+from ctrlplan.trajectories.common import (
+    Array,
+    are_finite,
+    by_orders,
+    derivative_scale,
+    mapped_time,
+    readonly,
+    scales_of_orders,
+)
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
@@ -464,11 +472,11 @@ class PiecewiseSpline(WaypointSpline):
         duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
         u, scale = s / duration, derivative_scale(duration, order)[:, None, None]
         if len(self._pieces) == 1:
-            out = self._pieces[0].jet(segment, u, order) * scale
+            out = by_orders(self._pieces[0].jet(segment, u, order), scale)
         else:
             out = np.empty((order + 1, self.naxes, u.size))
             for pieces in self._pieces:
-                out[:, list(pieces.axes)] = pieces.jet(segment, u, order) * scale
+                out[:, list(pieces.axes)] = by_orders(pieces.jet(segment, u, order), scale)
         self._place_filled(np.array([segment]).repeat(s.size), s, 0, out)
         return out
 

@@ -241,11 +241,14 @@ def _passing(law: Trajectory, values: Array, target: float, slack: float) -> flo
     """Time at which an increasing law, with given values at its breakpoints, reaches a target."""
     from scipy.optimize import brentq  # takes a fifth of the time of importing all trajectories
 
-    nearest = int(np.abs(values - target).argmin())
+    following = int(np.searchsorted(values, target))
+    nearest = min(max(following - 1, 0), values.size - 1)
+    if following < values.size and abs(values[following] - target) < abs(values[nearest] - target):
+        nearest = following
     # At a rate of 0 the error of a root would be the square root of the rounding.
     if abs(values[nearest] - target) <= slack:
         return float(law.breakpoints[nearest])
-    segment = int(np.searchsorted(values, target)) - 1
+    segment = following - 1
     origin, end = law.breakpoints[segment : segment + 2].tolist()
 
     def excess(s: float) -> float:

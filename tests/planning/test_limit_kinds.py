@@ -273,6 +273,16 @@ def test_an_interval_outside_of_the_plan_is_an_error(during):
         margins(MOVE, {"y_d1": Limits(high=1.0, during=during)})
 
 
+@pytest.mark.parametrize("along", [(2.0, 3.0), (-1.0, 0.0), (1.0, 2.0)])
+def test_limits_at_times_outside_of_the_plan_are_an_error(along):
+    limits = {"y_d1": Limits(high=[1.0, 1.0], along=along), "y_d2": 5.0}
+    with pytest.raises(ValueError, match="along of y_d1 must overlap the plan, from 0 to 1 s, got"):
+        margins(MOVE, limits)
+    for hold in ("shape", "waypoints", "path"):
+        with pytest.raises(ValueError, match="along of y_d1 must overlap the plan, from 0 to 1 s, got"):
+            fastest(MOVE, limits, hold=hold)
+
+
 def test_several_limits_of_one_signal():
     limits = {"y_d1": [Limits(high=1.9), Limits(high=1.0, during=(0.0, 0.2)), Limits(rms=1.3)]}
     found = margins(MOVE, limits)

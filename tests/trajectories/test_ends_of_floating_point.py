@@ -134,9 +134,20 @@ def test_entries_that_would_vanish_or_overflow_are_no_free_ones():
     np.testing.assert_array_equal(still.jet, [[3.0], [0.0], [0.0]])
 
 
+@pytest.mark.parametrize("spline", [PolySpline, PiecewiseSpline])
+@pytest.mark.parametrize(("duration", "order"), [(1e-3, 97), (1e-3, 100), (1e-9, 50), (1e-50, 9), (1e9, 100)])
+@pytest.mark.parametrize("share", [0.5, [0.5], np.linspace(0.0, 1.0, 7), np.linspace(0.0, 1.0, 500)], ids=np.size)
+def test_derivatives_above_the_degree_are_0(spline, duration, order, share):
+    plan = spline([Waypoint(0, [0, 1], 0, 0), Waypoint(duration, [1, 5], 0, 0)])
+    jet = plan.jet(np.multiply(share, duration), order)
+    np.testing.assert_array_equal(jet[6:], 0.0)
+    assert np.isfinite(jet).all()
+    assert jet[5] * duration**5 == pytest.approx(np.multiply.outer([720.0, 2880.0], np.ones_like(share)), rel=1e-12)
+
+
 def test_derivatives_beyond_floating_point():
-    plan = PolySpline([Waypoint(0, 0), Waypoint(1e-70, 1)])
-    assert float(plan(5e-71, 1)) == pytest.approx(1e70, rel=1e-14)
+    plan = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1e-70, 1, 0, 0)])
+    assert float(plan(5e-71, 1)) == pytest.approx(1.875e70, rel=1e-14)
     for call in (lambda: plan.jet(0.0, 5), lambda: plan(0.0, 5), lambda: plan.series(0.0, 5)):
         with pytest.raises(ValueError, match="derivative 5 must stay within floating point, got a duration of 1e-70 s"):
             call()

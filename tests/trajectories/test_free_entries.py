@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from repetitions import examples
 from trajectory_oracle import Direct, error, miss, waypoints
 
-from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
+from ctrlplan.trajectories import PiecewiseSpline, PolySpline, TrigSpline, Waypoint
 
 # Data drawn at random and every alpha: most of these plans swing, on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
@@ -133,3 +133,12 @@ def test_free_entries_are_met_wherever_they_are_determined(data):
     plan = TrigSpline(waypoints(times, jets), alpha=alpha)
     assert miss(plan) <= 1e-12
     assert error(plan, oracle, ntime=11) <= 1e-11
+
+
+@pytest.mark.parametrize("order", [3, 4, 9])
+@pytest.mark.parametrize("spline", [PolySpline, PiecewiseSpline])
+def test_a_derivative_above_the_degree_determines_nothing(spline, order):
+    """Two positions and one such derivative: a parabola has none."""
+    start = Waypoint.from_jets(0, y=[0.0, *[np.nan] * (order - 1), 1.0])
+    with pytest.raises(ValueError, match=r"free entries .* undetermined|must be determined|must determine it"):
+        spline([start, Waypoint.from_jets(1, y=[1.0])])

@@ -2,6 +2,8 @@
 
 import json
 import pickle
+import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -114,6 +116,29 @@ def test_threads_and_new_objects_get_the_same_bits():
     TRIG.jet(np.linspace(0.0, 4.0, 5000), 4)
     for jet in found:
         np.testing.assert_array_equal(jet, TRIG.jet(0.7, 3))
+
+
+@pytest.mark.parametrize("alpha", [0.0, 2.0])
+@pytest.mark.parametrize("spline", [TrigSpline, PiecewiseSpline])
+def test_threads_get_the_same_extrema(spline, alpha):
+    """Places that one thread has just found are no first approximations for the others."""
+    points = [Waypoint(0, 0, 0, 0), Waypoint(1, 1), Waypoint(3, 2, 0, 0)]
+    alone = spline(points, alpha=alpha, warn=False)
+    expected = alone.peak(2).tobytes(), alone.extrema(1).time_max.tobytes()
+    together, before = threading.Barrier(8), sys.getswitchinterval()
+
+    def first_call(plan):
+        together.wait()
+        return plan.peak(2).tobytes(), plan.extrema(1).time_max.tobytes()
+
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            for _ in range(60):
+                plan = spline(points, alpha=alpha, warn=False)
+                assert set(pool.map(first_call, [plan] * 8)) == {expected}
+    finally:
+        sys.setswitchinterval(before)
 
 
 @every
