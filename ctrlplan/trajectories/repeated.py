@@ -180,6 +180,10 @@ class Repeated(Trajectory):
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         return self.plan.segment_jet(int(self._own(segment)), s, order)
 
+    def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
+        """Derivatives, each time in its own segment; as `Trajectory.segments_jet`."""
+        return self.plan.segments_jet(self._own(segments), s, order)
+
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         return self.plan.segment_series(int(self._own(segment)), s, order)

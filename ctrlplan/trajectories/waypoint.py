@@ -202,7 +202,7 @@ class Waypoint(Displayed, Fields):
 
     def scaled(self, time: float, rate: float) -> Waypoint:
         """Same point at another time, with scaled derivatives."""
-        moved = times_powers(self.jet, rate, np.arange(len(self.jet))[:, None])
+        moved = self.jet if rate == 1.0 else times_powers(self.jet, rate, np.arange(len(self.jet))[:, None])
         return Waypoint.from_array(checked_finite(time, "time"), moved, self.labels)
 
     def truncated(self, order: int) -> Waypoint:
