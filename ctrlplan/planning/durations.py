@@ -167,9 +167,10 @@ class PlansByDuration:
         """Jets (order + 1, naxes, ndurations, ntime) from samples of each part."""
         orders = np.arange(self.limited.order + 1)[:, None]
         jets: Array = np.zeros(())
-        for part, own in zip(self._parts, samples, strict=True):
-            powers = (durations / own.duration) ** (part.order - orders)
-            jets = jets + own.jet[:, :, None] * powers[:, None, :, None]
+        with np.errstate(over="ignore", invalid="ignore"):  # extreme durations are rejected when a plan is made
+            for part, own in zip(self._parts, samples, strict=True):
+                powers = (durations / own.duration) ** (part.order - orders)
+                jets = jets + own.jet[:, :, None] * powers[:, None, :, None]
         return jets
 
 

@@ -653,10 +653,11 @@ def _fastest_by_derivatives(
         raise ValueError(
             f"plan must be continuous, got {jump.label} that jumps by {jump.size:.4g} at {time_text(jump.time)} s"
         )
+    _check_rest(plan, limited)
     if not limited.order:
         raise ValueError("limits must include one that a shorter plan would violate, got none")
-    _check_rest(plan, limited)
     _closed_form(plan, limited)  # raises for a direction in which no velocity is allowed
+    _check_velocities_at_rest(plan, limited)
     on_path = limited if limited.is_constant else limited.at_positions()
     find = _with_given_ends if ends == "given" else _with_free_ends
     found, margins, stops = find(plan, on_path, span)
@@ -996,6 +997,23 @@ def _check_rest(plan: Trajectory, limited: Limited) -> None:
             f"limits must be satisfied at rest, at any duration, got {bound.name} = {value:.6g} at rest "
             f"at {where}, where it must be {bound.range}"
         )
+
+
+def _check_velocities_at_rest(plan: Trajectory, limited: Limited) -> None:
+    """Raise for limits of velocities over time that exclude 0 where the plan is at rest, with any time law."""
+    for bound in limited.bounds:
+        if bound.axis is None or bound.order != 1 or bound.is_constant:
+            continue
+        still = (
+            np.abs(plan(plan.breakpoints, 1)).reshape(plan.naxes, -1)[bound.axis] <= _ZERO * plan.peak(1)[bound.axis]
+        )
+        times = plan.breakpoints[still]
+        low, high = bound.sides(times)
+        for k in np.flatnonzero((low > 0.0) | (high < 0.0))[:1].tolist():
+            raise ValueError(
+                f"limits of {bound.name} must include 0, the value at rest, got from {low[k]:.4g} to {high[k]:.4g} at "
+                f"{time_text(times[k])} s of the given plan, where it is at rest"
+            )
 
 
 def _closed_form(plan: Trajectory, limited: Limited, highest: float = math.inf) -> float:

@@ -108,3 +108,23 @@ def test_a_limit_like_a_square_root_is_satisfied(least):
     found = fastest(limit)
     assert found.margins.satisfied
     assert optimum(limit, 0.3) * (1.0 - 1e-5) <= found.duration <= 1.01 * optimum(limit, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        (
+            {"y_d1": cp.Limits(lambda s: 0.1 + 0.0 * s, lambda s: 0.4 + 0.0 * s)},
+            r"limits of y_d1 must include 0, the value at rest, got from 0.1 to 0.4 at 3 s of the given plan",
+        ),
+        (
+            {"y_d1": cp.Limits([-1.0, 0.2, 0.2], [1.0, 1.0, 1.0], along=[3.0, 3.9, 4.0]), "y_d2": 1.0},
+            r"limits of y_d1 must include 0, the value at rest, got from 0.2 to 1 at 4 s of the given plan",
+        ),
+        ({"y": 0.5}, r"limits must be satisfied at rest, at any duration, got y = 1 at rest at y = 1"),
+    ],
+)
+def test_limits_that_no_time_law_satisfies_at_rest(limits, said):
+    plan = cp.PolySpline([cp.Waypoint(3, 0, 0, 0), cp.Waypoint(4, 1, 0, 0)])
+    with pytest.raises(ValueError, match=said):
+        cp.fastest(plan, limits, hold="path")
