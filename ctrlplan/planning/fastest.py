@@ -461,14 +461,17 @@ def _with_smooth_stops(plan: Trajectory, limited: Limited, lap: bool) -> tuple[T
     """Plan whose limited signals are finite where the path requires a stop, and the times of its corners."""
     try:
         limited.check_smooth(plan)
-    except ValueError:
+    except ValueError as error:
         if plan.jumps(0) or not limited.is_constant:
             raise
         own, corners = stopping(plan, limited.order, lap)
         with suppress(ValueError):
             limited.check_smooth(own)
             return own, corners
-        raise
+        raise ValueError(
+            f"{error}; the path may have corners, where the plan stops, but not jumps of its derivatives in motion: "
+            "give a spline on it with velocities and accelerations at its waypoints"
+        ) from None
     return plan, ()
 
 
