@@ -167,6 +167,24 @@ def test_plans_and_limits_that_are_rejected(plan, message):
         fastest(plan, {"jerk": 10.0}, hold="path")
 
 
+@pytest.mark.parametrize(
+    ("length", "duration", "limits"),
+    [
+        (0.34254, 97.46, (9.155, 2.35, 2.0)),
+        (0.01298, 0.0314, (2.194, 1.9696, 1.7013)),
+        (0.039913, 0.633, (3.914, 0.28926, 0.12707)),
+        (0.5022, 3.026, (9.777, 7.905, 0.83194)),
+        (70.0, 1.0, (1.0, 1.0, 1.0)),
+    ],
+)
+def test_a_straight_line_in_motion_is_passed_at_the_limit_of_the_velocity(length, duration, limits):
+    """Whatever the limits of acceleration and jerk, of which the inequalities have terms of 1e10 that cancel."""
+    plan = PiecewiseSpline([Waypoint(0, [0, 0]), Waypoint(duration, [length, -0.3 * length])])
+    found = fastest(plan, limits_of(*limits), hold="path")
+    assert found.duration == pytest.approx(length / limits[0], rel=1e-6)
+    assert found.margins.satisfied
+
+
 def one_metre(jerk):
     """Minimum time from rest to rest with an acceleration of at most 1 m/s^2."""
     if jerk**2 >= 2.0:

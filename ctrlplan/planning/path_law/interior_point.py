@@ -34,6 +34,9 @@ _NEAREST = 0.02
 _MISSED = 1e-6
 """Distance from inequalities, relative to the limits, that is no rounding."""
 
+_ROUNDING = 16.0 * float(np.finfo(float).eps)
+"""Rounding of the sum of a row relative to its terms."""
+
 _STEP = 0.98
 """Step relative to the longest one within the inequalities."""
 
@@ -137,7 +140,7 @@ class _Search:
             gap, tolerance = float(y @ w), _GAP * self._duration(x)
             # Without a duality gap the duration decreases at most by the residual times the remaining step.
             residual = free * step * (gradient - self._pulled(y))
-            if gap < tolerance and np.abs(residual).sum() < tolerance and missed.min() > -self._accuracy:
+            if gap < tolerance and np.abs(residual).sum() < tolerance and self._is_feasible(x, missed):
                 return self._scale * x
             try:
                 solve = self._solver(curvature, y / w)
@@ -156,9 +159,19 @@ class _Search:
             primal, dual = (min(1.0, _STEP * _longest(own, change, 2.0)) for own, change in ((w, dw), (y, dy)))
             step = np.abs(dx)
             x, w, y = x + primal * dx, w + primal * dw, y + dual * dy
-        if not missed.min() > -self._accuracy:
+        if not self._is_feasible(x, missed):
             self._raise_infeasible()
         return self._scale * x
+
+    def _is_feasible(self, x: Array, missed: Array) -> bool:
+        """Whether all limits hold, up to the accuracy and rounding of the rows, whose terms may be far above them."""
+        if missed.min() > -self._accuracy:
+            return True
+        terms = _applied(np.abs(self._rows), np.abs(x)[self._index])
+        rounding = np.zeros(missed.size)
+        rounding[: self._upper.size] = terms.ravel()
+        rounding[self._upper.size : self._upper.size + self._lower.size] = terms[: len(self._lower)].ravel()
+        return bool((missed + _ROUNDING * rounding).min() > -self._accuracy)
 
     def _raise_infeasible(self) -> NoReturn:
         if self._fixed.any():
