@@ -178,10 +178,14 @@ def test_plans_and_limits_that_are_rejected(plan, message):
     ],
 )
 def test_a_straight_line_in_motion_is_passed_at_the_limit_of_the_velocity(length, duration, limits):
-    """Whatever the limits of acceleration and jerk, of which the inequalities have terms of 1e10 that cancel."""
+    """Whatever the limits of acceleration and jerk, of which the inequalities have terms of 1e10 that cancel.
+
+    The duration is optimal up to the duality gap of 1e-3.
+    """
     plan = PiecewiseSpline([Waypoint(0, [0, 0]), Waypoint(duration, [length, -0.3 * length])])
     found = fastest(plan, limits_of(*limits), hold="path")
-    assert found.duration == pytest.approx(length / limits[0], rel=1e-6)
+    best = length / limits[0]
+    assert best * (1.0 - 1e-9) <= found.duration <= 1.001 * best
     assert found.margins.satisfied
 
 
