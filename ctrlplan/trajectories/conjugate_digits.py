@@ -24,11 +24,11 @@ from ctrlplan.trajectories.digits import basis_series
 
 Ends = tuple[tuple[int, ...], tuple[int, ...]]
 """Orders of the derivatives that determine a segment, at its start and at its end."""
-_LOST = 15
-"""Digits that elimination may lose where the equations are singular; 40 more are used than the times require."""
-
 _Row = tuple[dict[int, Decimal], list[Decimal]]
 """An equation: its coefficients by unknown, and its right sides."""
+
+_ABOVE = 15
+"""Digits by which a pivot of singular equations may exceed rounding; 40 more are used than the times require."""
 
 
 def conjugate_digits(
@@ -64,7 +64,7 @@ def conjugate_digits(
         place = {entry: n for n, entry in enumerate(free)}
         weights = [_derivatives(alpha, pair, size, digits) for pair in ends]
         equations = [_jump(entry, place, steps, weights, ends, table) for entry in free]
-        solution = _solved(equations, rounding=Decimal(10) ** (_LOST - digits))
+        solution = _solved(equations, rounding=Decimal(10) ** (_ABOVE - digits))
     return None if solution is None else np.array(solution, dtype=object)
 
 
