@@ -454,16 +454,24 @@ def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, floa
         found = _fastest_by_derivatives(own, limited, span, ends)
     else:
         found = (_with_given_speeds if ends == "given" else _fastest_by_signals)(own, limited, span)
-    return replace(found, stops=corners)
+    if own is not plan:
+        late = found.plan.shift(plan.start)
+        return replace(found, plan=late, margins=limited.margins(late), stops=corners)
+    return found
 
 
 def _with_smooth_stops(plan: Trajectory, limited: Limited, lap: bool) -> tuple[Trajectory, tuple[float, ...]]:
-    """Plan whose limited signals are finite where the path requires a stop, and the times of its corners."""
+    """Plan with finite limited signals where its path requires a stop, from time 0 on, and the times of its corners.
+
+    The plan itself if its signals are finite.
+    """
     try:
         limited.check_smooth(plan)
     except ValueError as error:
-        if plan.jumps(0) or not limited.is_constant:
+        if plan.jumps(0):
             raise
+        if not limited.is_constant:
+            raise ValueError(f"{error}; a plan stops at corners with constant limits only") from None
         own, corners = stopping(plan, limited.order, lap)
         with suppress(ValueError):
             limited.check_smooth(own)

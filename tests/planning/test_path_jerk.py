@@ -156,7 +156,7 @@ def test_stops_and_dwells_remain():
     ("plan", "message"),
     [
         (
-            PiecewiseSpline([Waypoint(0, 0), Waypoint(1, 1), Waypoint(2, 3)]),
+            cp.Trapezoid(1.0, velocity=1.0, acceleration=2.0),
             "limits of y_d3 require a plan that is continuous up to",
         ),
         (PolySpline([Waypoint(0, 0, 1, 0), Waypoint(1, 1, 1, 0)]), "limits must bound the speed along the whole path"),
@@ -187,6 +187,30 @@ def test_a_straight_line_in_motion_is_passed_at_the_limit_of_the_velocity(length
     best = length / limits[0]
     assert best * (1.0 - 1e-9) <= found.duration <= 1.001 * best
     assert found.margins.satisfied
+
+
+def test_speeds_that_jump_on_a_straight_line_are_made_equal():
+    """Two metres at the limit of the velocity, and a rounded series of points; a corner and a dwell beside them."""
+    limits = limits_of(1, 1, 2)
+    line = PiecewiseSpline([Waypoint(0, 0), Waypoint(1, 1), Waypoint(3, 2)])
+    assert 2.0 <= fastest(line, limits, hold="path").duration <= 2.002
+    even = PiecewiseSpline([Waypoint(1e6 + 0.3 + 0.1 * k, k) for k in range(7)])
+    assert 6.0 <= fastest(even, limits, hold="path").duration <= 6.006
+
+
+def test_a_cyclic_polygon_that_closes_inside_a_side_remains_closed():
+    """Four sides from stop to stop; the acceleration is continuous where the lap closes."""
+    corners = [
+        Waypoint(0, [0.5, 0]),
+        *(Waypoint(k + 0.5, corner) for k, corner in enumerate([*CORNERS[1:], CORNERS[0]])),
+    ]
+    plan = PiecewiseSpline.cyclic(corners, 4.0)
+    found = fastest(plan, limits_of(50, 1, 5), hold="path")
+    best = 4 * one_metre(5.0)
+    assert best * (1 - 1e-6) <= found.duration <= 1.01 * best
+    assert found.stops == (0.5, 1.5, 2.5, 3.5)
+    lap = found.plan.repeat(2)
+    assert {jump.time for jump in lap.jumps(2) if jump.size > 1e-6} <= {lap.start, lap.end}
 
 
 def one_metre(jerk):

@@ -116,7 +116,12 @@ def test_what_is_beyond_the_range_says_so():
             cp.simulate(ct.ss(*matrices), t, cp.Step(1.0))
     far = ct.series(ct.ss(-1.0, 1e200, 1.0, 0.0), ct.ss(-1.0, 1.0, 1e200, 0.0))
     assert np.isposinf(cp.simulate(far, [0.0, 1.0], 1.0).outputs[1])
-    plan = cp.PolySpline([cp.Waypoint(0.0, 0, 0, 0), cp.Waypoint(1e-25, 1, 0, 0)])
+    points = [cp.Waypoint(0.0, 0, 0, 0), cp.Waypoint(1e-25, 1, 0, 0)]
+    short, one = cp.PolySpline(points), cp.PolySpline([cp.Waypoint(0.0, 0, 0, 0), cp.Waypoint(1.0, 1, 0, 0)])
+    found = cp.simulate(ct.ss(-1e25, 1e25, 1.0, 0.0), [0.0, 1e-25, 2e-25], short)  # higher derivatives are 0
+    expected = cp.simulate(ct.ss(-1.0, 1.0, 1.0, 0.0), [0.0, 1.0, 2.0], one)
+    np.testing.assert_allclose(found.outputs, expected.outputs, rtol=1e-12, atol=0.0)
+    plan = cp.TrigSpline(points, alpha=1.0)
     with pytest.raises(
         ValueError,
         match=r"derivatives of inputs up to order 17 must not overflow, got an overflow on a segment of 1e-25 s",
