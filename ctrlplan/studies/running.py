@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params
+from ctrlplan.metrics._held import Held
 from ctrlplan.simulation import (
     Event,
     Prepared,
@@ -22,7 +23,8 @@ from ctrlplan.simulation import (
     unchanged,
     unstable_poles,
 )
-from ctrlplan.simulation.simulate import simulate_with_later_events
+from ctrlplan.simulation.held_outputs import HeldOutputs
+from ctrlplan.simulation.simulate import simulate_for_metrics
 from ctrlplan.studies.connections import check_reached
 from ctrlplan.studies.measures import Run, checked_names
 from ctrlplan.trajectories import Trajectory
@@ -84,7 +86,7 @@ def run_plan(
             doubt = f"{name}: {_doubt(plan, times, state, why)}." if why else ""
         inputs, start = (plan if ready.ninputs else None), (0.0 if state is None else state)
         try:
-            response, stop = simulate_with_later_events(ready, times, inputs, start, params=params, events=events)
+            response, stop, held = simulate_for_metrics(ready, times, inputs, start, params=params, events=events)
         except Exception as error:
             if doubt:
                 error.add_note(doubt)
@@ -92,7 +94,15 @@ def run_plan(
     if doubt:
         warnings.warn(doubt, UserWarning, stacklevel=outside_stacklevel())
     stop = stop if response.time[-1] < times[-1] else None
-    return Run(plan, system, response, tracked, acting, last, _unstable(ready), doubt, stop)
+    return Run(plan, system, response, tracked, acting, last, _unstable(ready), doubt, stop, _held(system, held))
+
+
+def _held(system: Prepared, held: HeldOutputs | None) -> dict[str, Held]:
+    """Held parts of outputs by label."""
+    if held is None:
+        return {}
+    parts = zip(held.rows.tolist(), held.values, strict=True)
+    return {system.output_labels[row]: Held(held.times, values) for row, values in parts}
 
 
 def _unstable(system: Prepared) -> NDArray[np.complex128] | None:
