@@ -74,7 +74,7 @@ def run_plan(
     UserWarning
         If the run does not start at equilibrium.
     """
-    system = state_space(loop(name, plan) if is_builder(loop) else loop)
+    system = state_space(check_has_outputs(loop(name, plan)) if is_builder(loop) else loop)
     tracked, acting = _tracked(system, outputs, axes), acting_outputs(system, controls)
     with unchanged(system) as ready:
         check_reached(ready, tracked, plan)
@@ -122,6 +122,18 @@ def _doubt(plan: Trajectory, times: Array, state: Array, why: str) -> str:
 def is_builder(loop: object) -> TypeGuard[Callable[..., System]]:
     """Whether an object is a function that returns a loop; systems are callable as well."""
     return callable(loop) and not hasattr(loop, "output_labels")
+
+
+def check_returned(loop: System | Builder) -> System | Builder:
+    """Raise if a function has returned neither a loop nor a function of a plan that returns one."""
+    return loop if is_builder(loop) else check_has_outputs(loop)
+
+
+def check_has_outputs(loop: System) -> System:
+    """Raise if a function has returned no loop."""
+    if not hasattr(loop, "output_labels"):
+        raise TypeError(f"loop must return a control system, got {'None' if loop is None else type(loop).__name__}")
+    return loop
 
 
 def check_has_inputs(loop: System) -> System:
