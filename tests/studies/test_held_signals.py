@@ -228,7 +228,7 @@ def test_sweep():
 @pytest.mark.parametrize("size", [41, 333])
 @pytest.mark.parametrize("traced", [True, False])
 def test_a_nonlinear_loop_with_a_saturated_control(size, traced):
-    """The control passes a saturation, which has no states."""
+    """The control passes a saturation, which has no states, and a delay."""
 
     def limited(t, x, u, p):
         return np.clip(u, -0.8, 0.8) if traced else np.array([max(-0.8, min(0.8, float(u[0])))])
@@ -240,8 +240,9 @@ def test_a_nonlinear_loop_with_a_saturated_control(size, traced):
 
     pendulum = ct.nlsys(swing, lambda t, x, u, p: x[:1], states=2, inputs="usat", outputs="y", name="pendulum")
     clip = ct.nlsys(None, limited, inputs="u", outputs="usat", name="clip")
-    blocks = [pendulum, clip, cp.sample_hold(law(0.2), 0.2, 0.05)]
-    whole = ct.interconnect(blocks, inputs="r", outputs=["y", "u", "usat"])
+    late = cp.create_delay_iosystem(0.13, inputs="u", outputs="ulate", name="late")
+    blocks = [pendulum, clip, late, cp.sample_hold(law(0.2), 0.2, 0.05)]
+    whole = ct.interconnect(blocks, inputs="r", outputs=["y", "u", "usat", "ulate"])
     x, xi, u, t = np.zeros(2), 0.0, 0.0, 0.0
     marks, values = [0.0], [0.0]
     for k in range(25):
@@ -251,10 +252,12 @@ def test_a_nonlinear_loop_with_a_saturated_control(size, traced):
         u, xi = 0.5 * xi + 2.0 * (1.0 - x[0]), xi + 0.2 * (1.0 - x[0])
         marks.append(instant)
         values.append(u)
-    found = cp.compare(whole, STEP, np.linspace(0, 5, size), controls=["u", "usat"]).metrics["step"]
+    found = cp.compare(whole, STEP, np.linspace(0, 5, size), controls=["u", "usat", "ulate"]).metrics["step"]
     marks, values = np.array(marks), np.array(values)
     close(found, expected(marks, values, 5.0), 1e-6, "_u")
     close(found, expected(marks, np.clip(values, -0.8, 0.8), 5.0), 1e-6, "_usat")
+    marks = np.append(0.0, marks[1:] + 0.13)
+    close(found, expected(marks[marks <= 5.0], values[marks <= 5.0], 5.0), 1e-6, "_ulate")
 
 
 @pytest.mark.parametrize("size", [101, 450])
