@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan.metrics._error import squared
 from ctrlplan.metrics._evaluation import Evaluation, Later, evaluated
 from ctrlplan.metrics._pieces import cubics
-from ctrlplan.metrics._records import Array, Value, diverged, each, fitted, real, times
+from ctrlplan.metrics._records import QUIET, Array, Value, diverged, each, fitted, real, times
 from ctrlplan.metrics._records import signal as checked
 
 _AT_LIMIT = 1e-9  # distance from a limit, relative to the range, that counts as saturation
@@ -171,6 +171,18 @@ def saturation_time(timepts: ArrayLike, u: ArrayLike, lower: ArrayLike, upper: A
 def magnitude(evaluation: Evaluation, rows: slice) -> Later:
     """Return the peak magnitudes of signals."""
     return evaluation.maxima(rows, np.zeros(rows.stop - rows.start))
+
+
+def varied(evaluation: Evaluation, rows: slice) -> Later:
+    """Return the total variations of signals."""
+
+    def values() -> Array:
+        t, signals, stepped = evaluation.grid.t, evaluation.signals(rows), evaluation.stepped(rows)
+        with np.errstate(**QUIET):
+            found = [stepped[i].variation() if i in stepped else variation(t, f) for i, f in enumerate(signals)]
+        return np.array(found)
+
+    return values
 
 
 def variation(t: Array, f: Array) -> float:

@@ -5,7 +5,7 @@ exclude nearly all samples from the search for peaks and for entries into a band
 the curvature is smooth, and the cubics of all other intervals, whichever metric needs them, are found in one call.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.metrics._extremes import Sought, bounds, largest, last_beyond, last_entries, search
 from ctrlplan.metrics._grid import Grid
+from ctrlplan.metrics._held import Held, Stepped
 from ctrlplan.metrics._integrals import areas, rough, squares
 from ctrlplan.metrics._pieces import cubics_of_rows
 from ctrlplan.metrics._records import HUGE, QUIET, Array, Value, plain, real
@@ -48,18 +49,33 @@ class Evaluation:
     def __init__(self, timepts: ArrayLike) -> None:
         self.grid = Grid.of(timepts)
         self._signals, self._count = list[tuple[Array, str, slice]](), 0
+        self._held = dict[int, Held]()
         self._edges, self._sides = _Wanted(), _Wanted()
         self._integrals = dict[tuple[Callable[..., Array], int], slice]()
 
-    def add(self, f: Array, name: str) -> slice:
-        """Return the rows of signals (nrows, ntime) without nan; messages call them `name`."""
+    def add(self, f: Array, name: str, held: Sequence[Held | None] = ()) -> slice:
+        """Return the rows of signals (nrows, ntime) without nan; messages call them `name`.
+
+        `held` are the parts of the signals that are held between known times.
+        """
         for signal, _, rows in self._signals:
             if signal is f:
                 return rows
         rows = slice(self._count, self._count + len(f))
         self._signals.append((f, name, rows))
+        for i, part in enumerate(held):
+            if part is not None and part.jumps(f[i]):
+                self._held[rows.start + i] = part
         self._count = rows.stop
         return rows
+
+    def signals(self, rows: slice) -> Array:
+        """Return the signals of some rows that were added together, (nrows, ntime)."""
+        return next(real(signal, name) for signal, name, own in self._signals if own == rows)
+
+    def stepped(self, rows: slice) -> dict[int, Stepped]:
+        """Return those of the signals that have a held part, by their index among the rows."""
+        return {row - rows.start: self._stepped[row] for row in self._held if rows.start <= row < rows.stop}
 
     def entries(self, rows: slice, edges: Array) -> Later:
         """Return the times from which on the magnitudes of signals are at most their edges, (nrows,).
@@ -67,7 +83,7 @@ class Evaluation:
         -inf if always, inf if a signal is outside after the last sample but one.
         """
         own = self._edges.add(rows, edges, True)
-        return lambda: self._found[0][own]
+        return lambda: self._with_held(self._found[0][own], rows, lambda f, i: f.entry(float(edges[i])))
 
     def maxima(self, rows: slice, sides: Array, extrapolated: bool = True) -> Later:
         """Return the maxima of signals times their sides, 1 or -1, or of their magnitudes where the side is 0.
@@ -75,23 +91,46 @@ class Evaluation:
         They are those of all intervals, or of all without those that begin.
         """
         own = self._sides.add(rows, sides, extrapolated)
-        return lambda: self._found[1][own]
+        return lambda: self._with_held(self._found[1][own], rows, lambda f, i: f.maximum(float(sides[i]), extrapolated))
 
     def areas(self, rows: slice) -> Later:
         """Return the integrals of magnitudes, and of these times the time since the first sample, (2, nrows)."""
         self._integrals[areas, rows.start] = rows
-        return lambda: self._found[2][areas, rows.start]
+        return lambda: self._with_held(self._found[2][areas, rows.start], rows, lambda f, _: f.areas())
 
     def squares(self, rows: slice) -> Later:
         """Return the integrals of squares, (nrows,)."""
         self._integrals[squares, rows.start] = rows
-        return lambda: self._found[2][squares, rows.start]
+        return lambda: self._with_held(self._found[2][squares, rows.start], rows, lambda f, _: f.square())
+
+    def _with_held(self, found: Array, rows: slice, value: Callable[[Stepped, int], float | Array]) -> Array:
+        """Return values (..., nrows) of signals, with those of signals that have a held part in their places."""
+        stepped = self.stepped(rows)
+        found = found.copy() if stepped else found
+        with np.errstate(**QUIET):
+            for i, signal in stepped.items():
+                found[..., i] = value(signal, i)
+        return found
+
+    @cached_property
+    def _stepped(self) -> dict[int, Stepped]:
+        """Return the signals that have a held part, by row."""
+        found = dict[int, Stepped]()
+        for f, _, rows in self._signals:
+            for i in range(len(f)):
+                part = self._held.get(rows.start + i)
+                if part is not None:
+                    found[rows.start + i] = Stepped.of(self.grid.t, f[i], part)
+        return found
 
     @cached_property
     def _found(self) -> tuple[Array, Array, dict[tuple[Callable[..., Array], int], Array]]:
         """Return entries and maxima in the order in which they were added, and integrals."""
         signals = [signal for signal, _, _ in self._signals]
         f = np.ascontiguousarray(signals[0]) if len(signals) == 1 else np.concatenate(signals)
+        if self._held:  # these have cubics of their own
+            f = f.copy()
+            f[list(self._held)] = 0.0
         with np.errstate(**QUIET):
             limits = bounds(self.grid, f)
             if np.isnan(limits).any():

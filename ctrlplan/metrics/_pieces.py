@@ -14,6 +14,10 @@ of the limit is of fourth order too, so that the order of the metrics is preserv
 At the start of a record and after a jump or a kink, the curvature is known from later samples only. A response begins
 there, with dynamics that samples as far apart as its time constants do not show. An extremum before monotone samples,
 from the extrapolated curvature alone, is therefore no overshoot of a response.
+
+Where neighbouring intervals differ much in length, as next to an event, a jump or a rounding error in the shorter one
+is a slope that has no meaning for the longer one. A cubic that is farther from its chord than the samples about it are
+apart is therefore replaced by the chord; for intervals of similar length this bound is never reached.
 """
 
 from collections.abc import Callable
@@ -33,6 +37,7 @@ CURVATURES = 0.5  # difference relative to the smaller curvature up to which two
 _NEIGHBOURS = 4.0  # multiple of a neighbouring third difference above which there is a kink
 _ASIDE = 0.25  # of the larger curvature: a smaller one of opposite sign is the smooth side of a kink
 _JUMP = 2.0  # multiple of both neighbouring slopes above which there is a jump
+_UNEVEN = 4.0  # ratio of adjacent intervals up to which a cubic is near its chord, whatever the samples
 _ROUNDING = np.finfo(float).eps / 2  # of the terms of a cubic, up to which it is at a level
 _MANY = 0.1  # share of the intervals above which the cubics of all are computed
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -223,6 +228,8 @@ def _inner_cubics(grid: Grid, f: Array, rows: NDArray[np.intp], k: NDArray[np.in
     begins &= ~steady & (rise[2] * rise[3] > 0)
     square = step[2] * step[2]
     bow, twist = (base + step[1] * twist) * square, twist * (square * step[2])
+    if grid.farthest > 1.0:
+        _keep_near(samples.max(axis=0) - samples.min(axis=0), bow, twist)
     return Pieces(grid.t.take(k), step[2], samples[2], rise[2] - bow, bow - twist, twist, samples[3], jump, begins)
 
 
@@ -242,8 +249,19 @@ def cubics(t: Array, f: Array) -> Pieces:
     square = step * step
     bow *= square
     twist *= square * step
+    if np.any(np.maximum(step[..., 1:], step[..., :-1]) > _UNEVEN * np.minimum(step[..., 1:], step[..., :-1])):
+        wide = np.pad(f, [(0, 0)] * (f.ndim - 1) + [(2, 2)], mode="edge")
+        about = [wide[..., i : i + rise.shape[-1]] for i in range(6)]
+        _keep_near(np.maximum.reduce(about) - np.minimum.reduce(about), bow, twist)
     begins[..., :-1] &= rise[..., :-1] * rise[..., 1:] > 0
     return Pieces(t[..., :-1], step, f[..., :-1], rise - bow, bow - twist, twist, f[..., 1:], jump, begins)
+
+
+def _keep_near(apart: Array, bow: Array, twist: Array) -> None:
+    """Replace cubics by their chords where they are farther from these than the samples about them are apart."""
+    far = np.maximum(np.abs(bow), np.abs(bow + twist)) > 4 * apart
+    if far.any():
+        bow[far], twist[far] = 0.0, 0.0
 
 
 def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:

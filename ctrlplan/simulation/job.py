@@ -11,6 +11,7 @@ import numpy as np
 from ctrlplan._types import Array, Params
 from ctrlplan.simulation.built_forms import NotCompiledError
 from ctrlplan.simulation.events import Events, Snapshot, Watched, watched_events
+from ctrlplan.simulation.held_outputs import HeldOutputs
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import TimeSignal
@@ -118,6 +119,9 @@ class Record:
         blocks.
     inside : callable or None
         The same as `snapshot` to rounding, faster at one time.
+    held : callable or None
+        Returns the parts of the outputs that discrete blocks hold, or None if there
+        are none; their times may be sample times but for rounding.
     """
 
     times: Array
@@ -129,6 +133,7 @@ class Record:
     reason: str | Callable[[], str]
     is_pure: bool = False
     inside: Callable[[Array, Array], Snapshot] | None = None
+    held: Callable[[], HeldOutputs | None] | None = None
 
     def snapshot_at(self, k: int, t: float) -> Snapshot:
         """All signals at a time between times[k] and times[k + 1], for crossings of limits."""

@@ -97,6 +97,23 @@ class Block:
         return inner if inner is not None and inner.noutputs == self.system.noutputs else None
 
     @property
+    def holds(self) -> bool:
+        """Whether the outputs of a discrete block in a continuous loop are constant between its sample times."""
+        if self.period is None:
+            return False
+        if self.held is not None or self.system.outfcn is None:
+            return True
+        return not (can_remember(self.system) or reads(self.system.outfcn, _TIME) or reads(self.system.outfcn, _INPUT))
+
+    @property
+    def passes_steps(self) -> bool:
+        """Whether the outputs are constant while the inputs are: delays, and blocks without states and time."""
+        if self.delay is not None:
+            return True
+        plain = not (self.system.nstates or self.period is not None or self.plan is not None)
+        return plain and (self.linear or not (self.depends_on_time or can_remember(self.system)))
+
+    @property
     def is_time_function(self) -> bool:
         """Whether the outputs are functions of time only over a segment."""
         return self.plan is not None or self.delay is not None
@@ -271,6 +288,23 @@ class Network:
     def fed(self) -> list[Callable[[Array], Array]]:
         """Maps of all signals, time last, to the inputs of each block."""
         return [_product(self.wire[rows]) for rows in self.inputs]
+
+    @cached_property
+    def held_outputs(self) -> NDArray[np.intp]:
+        """Indices of the outputs of the system that are constant between the sample times of discrete blocks.
+
+        They depend on what these blocks hold only, through blocks without states and delays if there are any.
+        """
+        held = np.zeros(self.nsignals, dtype=np.bool_)
+        for block, place in zip(self.blocks, self.outputs, strict=True):
+            held[place] = block.holds
+        changed = bool(held.any())
+        while changed:
+            changed = False
+            for block, rows, place in zip(self.blocks, self.inputs, self.outputs, strict=True):
+                if block.passes_steps and not held[place].all() and not self.wire[rows][:, ~held].any():
+                    held[place], changed = True, True
+        return np.flatnonzero(~self.read[:, ~held].any(axis=1) & self.read.any(axis=1))
 
     @cached_property
     def to_outputs(self) -> Callable[[Array], Array]:

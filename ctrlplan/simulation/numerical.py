@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ctrlplan._types import Array
 from ctrlplan.simulation.budget import TimeLimitError
 from ctrlplan.simulation.events import Snapshot, Watched
+from ctrlplan.simulation.held_outputs import HeldOutputs
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.job import Job, Record, fresh_job, with_event_times
 from ctrlplan.simulation.network import Network
@@ -346,6 +347,7 @@ class Attempt(Generic[S]):
             reason if is_pure else reason(),
             is_pure,
             self._snapshot_inside,
+            self._held,
         )
 
     def expands(self) -> bool:
@@ -398,6 +400,15 @@ class Attempt(Generic[S]):
             return _seen(self.solver, t, x, np.zeros((0, t.size)), partial(self.time_signals.at, t))
         known = self.time_values(t)  # the caller may change samples later
         return _seen(self.solver, t, x, known[:ninputs], lambda: known)
+
+    def _held(self) -> HeldOutputs | None:
+        """Outputs that discrete blocks hold, from the start of each segment: they are sampled at these times only."""
+        rows, run = self.job.blocks.held_outputs, self.run
+        if not rows.size:
+            return None
+        times = np.unique([*(start for start, _ in run.segments), float(run.times[-1])])
+        seen = self._snapshot(times, run.states[:, np.searchsorted(run.times, times)])
+        return HeldOutputs(times, rows, seen.y.reshape(-1, times.size)[rows])
 
     def _snapshot_inside(self, t: Array, x: Array) -> Snapshot:
         """Snapshot at one time, with the series of the functions of time."""

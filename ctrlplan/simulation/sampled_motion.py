@@ -97,6 +97,11 @@ class LateSignal:
         """Whether it is always 0, as where registers hold all that has passed the delay."""
         return not (self._late.initial.any() or self._signals or self._firsts or self._late.follows)
 
+    @property
+    def is_constant(self) -> bool:
+        """Whether it is constant between its breakpoints, as what discrete blocks hold."""
+        return not (self._signals or self._late.follows)
+
     def breakpoints_between(self, t0: float, t1: float) -> Array:
         """Start of the delayed signals, and their breakpoints after it."""
         begin, end = (max(t - self._late.delay, self._first) for t in (t0, t1))

@@ -19,12 +19,14 @@ from ctrlplan._types import Array, Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.budget import begin_run
 from ctrlplan.simulation.events import Events, Occurrence, Snapshot, Watched, crossings
+from ctrlplan.simulation.held_outputs import HeldOutputs
 from ctrlplan.simulation.interpreted import FeedthroughError
 from ctrlplan.simulation.interruptions import passing_interruptions
 from ctrlplan.simulation.job import Job, Record, fresh_job
 from ctrlplan.simulation.methods import Method
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.response import SimulationResponse
+from ctrlplan.simulation.segments import time_tolerance
 from ctrlplan.simulation.signals import Inputs, input_signals
 from ctrlplan.simulation.starts import check_begin
 
@@ -185,10 +187,27 @@ def simulate_with_later_events(
     Other events are located when they are first read, if that calls no functions of
     the user: many runs are wanted for their metrics only.
     """
+    return simulate_for_metrics(system, timepts, inputs, initial_state, params=params, events=events)[:2]
+
+
+def simulate_for_metrics(
+    system: System | Prepared,
+    timepts: ArrayLike,
+    inputs: Inputs = None,
+    initial_state: ArrayLike | None = None,
+    *,
+    params: Mapping[str, object] | None = None,
+    events: Events = None,
+) -> tuple[SimulationResponse, Occurrence | None, HeldOutputs | None]:
+    """The same, and the parts of the outputs that discrete blocks hold; None if there are none."""
     job = checked_job(system, timepts, inputs, initial_state, params=params, events=events)
     warn_of_unread(job.prepared, job.params)
     warn_of_timebase(job.prepared)
-    return _response_and_end(job, methods.METHODS, later=True)
+    response, stop, record = _response_and_end(job, methods.METHODS, later=True)
+    held = record.held() if record.held is not None else None
+    if held is not None:
+        held = held.on(response.t, time_tolerance(job.first, float(job.times[-1])))
+    return response, stop, held
 
 
 def checked_job(
@@ -226,8 +245,13 @@ def response_to(job: Job, chosen: Sequence[Method]) -> SimulationResponse:
     return _response_and_end(job, chosen, later=False)[0]
 
 
-def _response_and_end(job: Job, chosen: Sequence[Method], later: bool) -> tuple[SimulationResponse, Occurrence | None]:
-    """Response by the first method that applies, and the event that ends it; others are located later, if possible."""
+def _response_and_end(
+    job: Job, chosen: Sequence[Method], later: bool
+) -> tuple[SimulationResponse, Occurrence | None, Record]:
+    """Response by the first method that applies, the event that ends it, and the record of the run.
+
+    Other events are located later, if possible.
+    """
     fresh = fresh_job(job)
     try:
         return _response(job, methods.recorded(job, chosen), later)
@@ -265,8 +289,8 @@ def warn_of_timebase(prepared: Prepared) -> None:
         warnings.warn(_NO_TIMEBASE.format(prepared.name), UserWarning, stacklevel=outside_stacklevel())
 
 
-def _response(job: Job, record: Record, later: bool) -> tuple[SimulationResponse, Occurrence | None]:
-    """Response at the times of a job, up to the event that ends it, and that event."""
+def _response(job: Job, record: Record, later: bool) -> tuple[SimulationResponse, Occurrence | None, Record]:
+    """Response at the times of a job, up to the event that ends it, that event, and the record."""
     prepared = job.prepared
     found = _Occurrences(record)
     times, states = record.times, record.states
@@ -301,7 +325,7 @@ def _response(job: Job, record: Record, later: bool) -> tuple[SimulationResponse
         reason=record.reason,
         events=found.located if later else found.located(),
     )
-    return response, stop
+    return response, stop, record
 
 
 class _Occurrences:

@@ -74,7 +74,8 @@ class Dispatch(Generic[T, R]):
     Tasks lost with their worker are sent again twice at most, one value at a
     time: first when all others have been sent, then with nothing else in flight,
     so that only the value that ends its worker remains without a result. A
-    broken process pool is replaced by a new one.
+    broken process pool is replaced by a new one. A future without the reply of a
+    worker counts as a lost task, and an OSError of ``submit`` is retried once.
 
     Parameters
     ----------
@@ -118,7 +119,7 @@ class Dispatch(Generic[T, R]):
         self._chunks: dict[int, _Chunk] = {}
         self._arrived: deque[tuple[int, R | Failed]] = deque()
         self._submitted = self._pool = self._carried = self._in_vain = 0
-        self._any_finished = self._travelled = False
+        self._any_finished = self._travelled = self._retried = False
 
     def outcomes(self) -> Generator[tuple[int, R | Failed], None, None]:
         """Number and outcome of each value, as they arrive; after a KeyboardInterrupt, those that have finished.
@@ -138,7 +139,8 @@ class Dispatch(Generic[T, R]):
                 self._read(*self._futures.next())
         except KeyboardInterrupt:
             for number, reply in self._futures.finished().items():
-                self._find(self._chunks[number], reply)
+                if isinstance(reply, Reply):
+                    self._find(self._chunks[number], reply)
             yield from self._arrivals()
             raise
         finally:
@@ -162,11 +164,14 @@ class Dispatch(Generic[T, R]):
                     self._chunks[self._submitted] = sent
                     self._submitted += 1
                     self._carried += carries
+                    self._retried = False
             except (Exception, SystemExit) as error:  # of the executor: it is broken, or cannot send the task
                 failed = Failed.of(error, by_executor=True)
-                if not self._renewed(failed.error, self._pool):
+                again = isinstance(error, OSError) and not self._retried
+                if not (self._renewed(failed.error, self._pool) or again):
                     self._give_up(failed, chunk)
                     return
+                self._retried |= again
                 self._waiting.appendleft(chunk)
 
     def _next(self) -> _Chunk | None:
@@ -182,10 +187,10 @@ class Dispatch(Generic[T, R]):
         task = Task(self.runs, self._key, values, self.timeout, chunk.carries)
         return self.executor.submit(run_task, task)
 
-    def _read(self, number: int, reply: Reply[R] | Failed) -> None:
+    def _read(self, number: int, reply: Reply[R] | Failed | object) -> None:
         """Take the outcomes of a task, and send again what it has not run."""
         chunk = self._chunks.pop(number)
-        if not isinstance(reply, Failed):
+        if isinstance(reply, Reply):
             _check_versions(reply)
             self._in_vain = 0
             if reply.absent and chunk.carries:
@@ -201,6 +206,9 @@ class Dispatch(Generic[T, R]):
             rest = [number for i, number in enumerate(chunk.numbers) if i not in reply.found]
             self._waiting.extend(_parts(rest, max(1, len(reply.found))))
             return
+        if not isinstance(reply, Failed):
+            what = f"the executor must return the result of the function submitted, got {reply!r:.80}"
+            reply = Failed.of(RuntimeError(what), by_executor=True)
         self._in_vain += 1
         self._renewed(reply.error, chunk.pool)
         if isinstance(reply.error, CANNOT_BE_SENT) and self._travelled:

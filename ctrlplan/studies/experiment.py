@@ -93,7 +93,8 @@ class Experiment(Displayed):
         piecewise. A plan that repeats for all future times is repeated until after the
         last sample time.
     timepts : ndarray, shape (ntime,)
-        Sample times [s]; metrics are refined between them.
+        Sample times [s]; metrics are refined between them, and those of signals
+        that discrete controllers hold take the held values from their instants on.
     waypoints : tuple of Waypoint
         Waypoints of the plans, for the metrics of the path.
     start : float or None
@@ -378,7 +379,9 @@ class Experiment(Displayed):
         y = np.stack([run.rows(run.outputs) for run in runs])
         u = np.stack([run.rows(run.controls) for run in runs])
         unstable = np.array([run.is_unstable for run in runs])
-        return self._metrics_of_rows(SignalRecord(first.t, y, u, self.axes, first.controls, unstable), first.plan)
+        held = tuple(run.held_parts for run in runs)
+        record = SignalRecord(first.t, y, u, self.axes, first.controls, unstable, held)
+        return self._metrics_of_rows(record, first.plan)
 
     def _metrics_of_rows(self, record: SignalRecord, plan: Trajectory) -> list[dict[str, float]]:
         """Metrics of each loop of a record, and of the path of the plan."""
@@ -415,7 +418,7 @@ class Experiment(Displayed):
         if np.count_nonzero(run.t >= self.since) >= 2:  # otherwise it ended before the interval of the metrics
             unstable = np.array([run.is_unstable])
             y, u = run.rows(run.outputs)[None], run.rows(run.controls)[None]
-            record = SignalRecord(run.t, y, u, axes, run.controls, unstable)
+            record = SignalRecord(run.t, y, u, axes, run.controls, unstable, (run.held_parts,))
             # Of all axes, which another plan may name otherwise, or of those that a log holds.
             plan = run.plan if len(axes) in (0, run.plan.naxes) else run.plan.select(axes)
             found = signal_metrics(record, plan, self.since, self.band, wanted)

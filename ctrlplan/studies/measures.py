@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from ctrlplan import metrics
 from ctrlplan._display import MISSING, ROWS, Displayed, Facts, Part, number
 from ctrlplan._types import Array
-from ctrlplan.metrics._control import magnitude
+from ctrlplan.metrics._control import magnitude, varied
 from ctrlplan.metrics._error import absolute
 from ctrlplan.metrics._evaluation import TOGETHER, Evaluation, Later
+from ctrlplan.metrics._held import Held
 from ctrlplan.metrics._response import exceeded, settled
 from ctrlplan.planning import SquaredDerivative
 from ctrlplan.simulation import Occurrence, Prepared, SimulationResponse
@@ -50,6 +51,9 @@ class Tracked:
     band, start : float
         Half width of the settling band relative to the range, and the start of
         the interval of the metrics [s].
+    held : tuple of Held or None
+        Part of each output that discrete blocks hold between known times; None
+        without one.
     """
 
     t: Array
@@ -60,6 +64,7 @@ class Tracked:
     span: Array
     band: float
     start: float
+    held: tuple[Held | None, ...] = ()
 
     @cached_property
     def error(self) -> Array:
@@ -98,11 +103,15 @@ class Acting:
         Controls.
     start : float
         Time [s] from which it is measured.
+    held : tuple of Held or None
+        Part of each control that discrete blocks hold between known times; None
+        without one.
     """
 
     t: Array
     u: Array
     start: float
+    held: tuple[Held | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -153,6 +162,8 @@ class Run:
         Warning that the run may not start at equilibrium; otherwise empty.
     stop : Occurrence or None
         Event that ended the run.
+    held : mapping of str to Held
+        Parts of outputs that discrete blocks hold between known times.
     """
 
     plan: Trajectory
@@ -164,6 +175,7 @@ class Run:
     unstable: NDArray[np.complex128] | None = None
     doubt: str = ""
     stop: Occurrence | None = None
+    held: Mapping[str, Held] = field(default_factory=dict)
 
     @property
     def is_unstable(self) -> bool:
@@ -183,6 +195,11 @@ class Run:
     def rows(self, names: tuple[str, ...]) -> Array:
         """Some of the outputs, (nnames, ntime)."""
         return np.array([self.signals[name] for name in names]).reshape(-1, self.t.size)
+
+    @property
+    def held_parts(self) -> tuple[Held | None, ...]:
+        """Held parts of the outputs, then of the controls."""
+        return tuple(self.held.get(name) for name in (*self.outputs, *self.controls))
 
 
 @dataclass(frozen=True, repr=False)
@@ -259,11 +276,19 @@ class _Shared:
         return self.start(Evaluation(seen.t), seen)()
 
 
+def _added(evaluation: Evaluation, seen: Tracked | Acting, signal: str, name: str) -> slice:
+    """Rows of a signal, with the parts of it that are held; messages call it `name`."""
+    rows = getattr(seen, signal)
+    if isinstance(seen, Acting):
+        return evaluation.add(rows, name, seen.held)
+    return evaluation.add(rows, name, [None if part is None else part.negative() for part in seen.held])
+
+
 def _settling(signal: str) -> _Shared:
     """Settling time of a signal of a `Tracked`, `error` or `remainder`."""
     return _Shared(
         lambda evaluation, seen: settled(
-            evaluation, evaluation.add(getattr(seen, signal), "y"), seen.final, seen.origin, seen.band, seen.start
+            evaluation, _added(evaluation, seen, signal, "y"), seen.final, seen.origin, seen.band, seen.start
         )
     )
 
@@ -272,7 +297,7 @@ def _exceeding(signal: str, side: float) -> _Shared:
     """Overshoot for the side -1 of a signal, which is a reference minus an output, or lag for the side 1."""
     return _Shared(
         lambda evaluation, seen: exceeded(
-            evaluation, evaluation.add(getattr(seen, signal), "y"), seen.final - seen.origin, side
+            evaluation, _added(evaluation, seen, signal, "y"), seen.final - seen.origin, side
         )
     )
 
@@ -281,14 +306,14 @@ def _area(signal: str, timed: bool = False) -> _Shared:
     """Integral of the magnitude of a signal, or of this times the time since the start."""
     return _Shared(
         lambda evaluation, seen: absolute(
-            evaluation, evaluation.add(getattr(seen, signal), "error"), seen.start if timed else None
+            evaluation, _added(evaluation, seen, signal, "error"), seen.start if timed else None
         )
     )
 
 
 def _square(signal: str) -> _Shared:
     """Integral of the square of a signal."""
-    return _Shared(lambda evaluation, seen: evaluation.squares(evaluation.add(getattr(seen, signal), signal)))
+    return _Shared(lambda evaluation, seen: evaluation.squares(_added(evaluation, seen, signal, signal)))
 
 
 def _of_path(metric: Callable[[Array, Array, Array], float | Array]) -> Callable[[Path], float | Array]:
@@ -404,14 +429,14 @@ MEASURES = {
         "Peak control",
         "{u}",
         "control",
-        _Shared(lambda evaluation, seen: magnitude(evaluation, evaluation.add(seen.u, "u"))),
+        _Shared(lambda evaluation, seen: magnitude(evaluation, _added(evaluation, seen, "u", "u"))),
     ),
     "control_effort": Measure("Control effort", "{u}^2 s", "control", _square("u"), definition=_CONTROL),
     "control_variation": Measure(
         "Total variation of the control",
         "{u}",
         "control",
-        lambda seen: metrics.total_variation(seen.t, seen.u),
+        _Shared(lambda evaluation, seen: varied(evaluation, _added(evaluation, seen, "u", "u"))),
         definition=_CONTROL,
     ),
     "wandering": Measure("Excess path length", "", "path", _of_path(metrics.wandering), definition=_PATH),
@@ -505,6 +530,9 @@ class SignalRecord:
         Labels of the plan's axes, and of the controls.
     unstable : ndarray of bool, shape (nloops,)
         Whether a loop is unstable, so that it never settles.
+    held : tuple of tuple of Held or None, optional
+        For each loop, parts of its outputs, then of its controls, that discrete
+        blocks hold between known times.
     """
 
     t: Array
@@ -513,6 +541,12 @@ class SignalRecord:
     axes: tuple[str, ...]
     controls: tuple[str, ...]
     unstable: NDArray[np.bool_]
+    held: tuple[tuple[Held | None, ...], ...] = ()
+
+    def held_parts(self, some: slice, of: slice) -> list[tuple[Held | None, ...]]:
+        """Held parts of outputs or controls of some loops, for each of `_rows`."""
+        loops = [parts[of] for parts in self.held[some]]
+        return loops if len(loops) < 2 else list(zip(*loops, strict=True))
 
 
 def signal_metrics(
@@ -544,9 +578,11 @@ def signal_metrics(
     for first in range(0, len(record.y), count):
         some = slice(first, first + count)
         y, u = record.y[some, :, known], record.u[some, :, known]
+        of_y, of_u = (record.held_parts(some, of) for of in (slice(y.shape[1]), slice(y.shape[1], None)))
+        acting = [Acting(t, rows, start, held) for rows, held in _with_held(_rows(u), of_u)]
         kinds: list[_Seen] = [
-            ("response", _tracked(t, y, course, band, start), record.axes),
-            ("control", [Acting(t, rows, start) for rows in _rows(u)], record.controls),
+            ("response", _tracked(t, y, course, band, start, of_y), record.axes),
+            ("control", acting, record.controls),
         ]
         parts.append(_values(kinds, measures, record.unstable[some], Evaluation(t)))
     if len(parts) == 1:
@@ -593,6 +629,13 @@ def _rows(signals: Array) -> list[Array]:
     return [signals[0]] if len(signals) == 1 else list(signals.swapaxes(0, 1))
 
 
+def _with_held(
+    rows: list[Array], held: list[tuple[Held | None, ...]]
+) -> Iterator[tuple[Array, tuple[Held | None, ...]]]:
+    """Rows with their held parts, if any are known."""
+    return zip(rows, held or [()] * len(rows), strict=True)
+
+
 @dataclass(frozen=True)
 class _Course:
     """Positions of a plan at sample times, and its ends and range, (naxes, ...)."""
@@ -609,13 +652,15 @@ class _Course:
         return cls(plan.jet(t, 0)[0], plan.initial, plan.final, span)
 
 
-def _tracked(t: Array, y: Array, course: _Course, band: float, start: float) -> list[Tracked]:
+def _tracked(
+    t: Array, y: Array, course: _Course, band: float, start: float, held: list[tuple[Held | None, ...]]
+) -> list[Tracked]:
     """Arguments of measures of responses, for each of `_rows`."""
     found = []
-    for k, rows in enumerate(_rows(y)):
+    for k, (rows, parts) in enumerate(_with_held(_rows(y), held)):
         own = slice(None) if len(y) == 1 else slice(k, k + 1)
         of_plan = (course.reference[own], course.initial[own], course.final[own], course.span[own])
-        found.append(Tracked(t, rows, *of_plan, band, start))
+        found.append(Tracked(t, rows, *of_plan, band, start, parts))
     return found
 
 

@@ -15,7 +15,7 @@ from typing import Protocol, TypeAlias, TypeGuard
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import check_kind, real_array
+from ctrlplan._checks import array_of_numbers, check_kind
 from ctrlplan._lru import Lru
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params
@@ -34,7 +34,7 @@ from ctrlplan.studies.experiment import Experiment
 from ctrlplan.studies.measured_together import MeasuredTogether
 from ctrlplan.studies.measures import Measure, Run, shown_measures
 from ctrlplan.studies.outcomes import Failed, OneByOne, Runs, tried
-from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder
+from ctrlplan.studies.running import Builder, System, check_has_inputs, check_has_outputs, check_returned, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 Forms: TypeAlias = Mapping[str, System]
@@ -48,6 +48,9 @@ Samples: TypeAlias = NDArray[np.intp]
 
 _STAND_INS = 20
 """Number of draws tried in place of a nominal loop that does not run."""
+
+_POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+"""Kinds of arguments that can be given by position."""
 
 _THREADS = 32
 """Number of threads for which the loops of a function are prepared separately."""
@@ -179,7 +182,7 @@ def monte_carlo(
 
 def _checked_draws(draws: Mapping[str, ArrayLike]) -> dict[str, Array]:
     check_kind(draws, "draws", Mapping, "a mapping of names to values, as the function draws returns it")
-    table = {name: np.atleast_1d(real_array(values, f"draws[{name!r}]")) for name, values in draws.items()}
+    table = {name: np.atleast_1d(array_of_numbers(values, f"draws[{name!r}]")) for name, values in draws.items()}
     sizes = {name: values.shape for name, values in table.items()}
     if not table or len(set(sizes.values())) != 1 or any(len(shape) != 1 or not shape[0] for shape in sizes.values()):
         raise ValueError(f"draws must have equally many values of each parameter, at least one, got shapes {sizes}")
@@ -213,7 +216,10 @@ def _is_of_draws(loop: object, table: dict[str, Array]) -> TypeGuard[Callable[..
     takes_any &= further <= {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
     if (set(table) <= named or takes_any) and _binds(signature, **dict.fromkeys(table, 0.0)):
         return True
-    if not _binds(signature, "", None) or set(list(signature.parameters)[:2]) & set(table):
+    first = list(signature.parameters)[:2]
+    required = [one for one in signature.parameters.values() if one.kind in _POSITIONAL and one.default is one.empty]
+    of_plan = (len(required) == 2 or first == ["name", "plan"]) and _binds(signature, "", None)
+    if not of_plan or set(first) & set(table):
         raise ValueError(
             "loop must be a control system whose blocks read the parameters, a function whose arguments have the names "
             f"of the draws ({', '.join(table)}), or a function of a plan's name and the plan, got {loop!r:.80} with "
@@ -328,7 +334,7 @@ class _Built:
         return _binds(inspect.signature(self.build))
 
     def nominal(self, params: Draw | None) -> tuple[System | Builder, Draw | None]:
-        return self.build(**(params or {})), None
+        return check_returned(self.build(**(params or {}))), None
 
     def runs(
         self, experiment: Experiment, samples: Samples, drawn: list[Draw], elsewhere: bool, timeout: float | None
@@ -338,8 +344,8 @@ class _Built:
         return Batches(experiment, build, alone, partial(_alike, experiment, samples), first), None
 
 
-def _with_draw(build: Callable[..., System], params: Draw) -> System:
-    return build(**params)
+def _with_draw(build: Callable[..., System], params: Draw) -> System | Builder:
+    return check_returned(build(**params))
 
 
 def _of_loop(experiment: Experiment, samples: Samples, loop: System | Builder) -> Outcome:
@@ -376,7 +382,7 @@ class _Prepared:
         """Prepare a loop, and check that its blocks read the parameters."""
         if is_builder(loop):
             build = loop
-            forms = tried(lambda _: {n: prepare(build(n, plan)) for n, plan in experiment.plans.items()}, None)
+            forms = tried(lambda _: _forms_of(build, experiment.plans), None)
             if isinstance(forms, Failed):
                 raise forms.error
         else:
@@ -429,9 +435,12 @@ class _Sent:
         if isinstance(self.given, Mapping):
             return self.given
         build = self.given
-        return self.made.get(
-            threading.get_ident(), lambda: {name: prepare(build(name, plan)) for name, plan in plans.items()}
-        )
+        return self.made.get(threading.get_ident(), lambda: _forms_of(build, plans))
+
+
+def _forms_of(build: Builder, plans: Mapping[str, Trajectory]) -> dict[str, Prepared]:
+    """Prepared loop of each plan, from a function of its name and the plan."""
+    return {name: prepare(check_has_outputs(build(name, plan))) for name, plan in plans.items()}
 
 
 def _elsewhere(sent: _Sent, experiment: Experiment, samples: Samples, params: Draw) -> Outcome:

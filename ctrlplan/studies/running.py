@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params
+from ctrlplan.metrics._held import Held
 from ctrlplan.simulation import (
     Event,
     Prepared,
@@ -22,7 +23,8 @@ from ctrlplan.simulation import (
     unchanged,
     unstable_poles,
 )
-from ctrlplan.simulation.simulate import simulate_with_later_events
+from ctrlplan.simulation.held_outputs import HeldOutputs
+from ctrlplan.simulation.simulate import simulate_for_metrics
 from ctrlplan.studies.connections import check_reached
 from ctrlplan.studies.measures import Run, checked_names
 from ctrlplan.trajectories import Trajectory
@@ -72,7 +74,7 @@ def run_plan(
     UserWarning
         If the run does not start at equilibrium.
     """
-    system = state_space(loop(name, plan) if is_builder(loop) else loop)
+    system = state_space(check_has_outputs(loop(name, plan)) if is_builder(loop) else loop)
     tracked, acting = _tracked(system, outputs, axes), acting_outputs(system, controls)
     with unchanged(system) as ready:
         check_reached(ready, tracked, plan)
@@ -84,7 +86,7 @@ def run_plan(
             doubt = f"{name}: {_doubt(plan, times, state, why)}." if why else ""
         inputs, start = (plan if ready.ninputs else None), (0.0 if state is None else state)
         try:
-            response, stop = simulate_with_later_events(ready, times, inputs, start, params=params, events=events)
+            response, stop, held = simulate_for_metrics(ready, times, inputs, start, params=params, events=events)
         except Exception as error:
             if doubt:
                 error.add_note(doubt)
@@ -92,7 +94,15 @@ def run_plan(
     if doubt:
         warnings.warn(doubt, UserWarning, stacklevel=outside_stacklevel())
     stop = stop if response.time[-1] < times[-1] else None
-    return Run(plan, system, response, tracked, acting, last, _unstable(ready), doubt, stop)
+    return Run(plan, system, response, tracked, acting, last, _unstable(ready), doubt, stop, _held(system, held))
+
+
+def _held(system: Prepared, held: HeldOutputs | None) -> dict[str, Held]:
+    """Held parts of outputs by label."""
+    if held is None:
+        return {}
+    parts = zip(held.rows.tolist(), held.values, strict=True)
+    return {system.output_labels[row]: Held(held.times, values) for row, values in parts}
 
 
 def _unstable(system: Prepared) -> NDArray[np.complex128] | None:
@@ -112,6 +122,18 @@ def _doubt(plan: Trajectory, times: Array, state: Array, why: str) -> str:
 def is_builder(loop: object) -> TypeGuard[Callable[..., System]]:
     """Whether an object is a function that returns a loop; systems are callable as well."""
     return callable(loop) and not hasattr(loop, "output_labels")
+
+
+def check_returned(loop: System | Builder) -> System | Builder:
+    """Raise if a function has returned neither a loop nor a function of a plan that returns one."""
+    return loop if is_builder(loop) else check_has_outputs(loop)
+
+
+def check_has_outputs(loop: System) -> System:
+    """Raise if a function has returned no loop."""
+    if not hasattr(loop, "output_labels"):
+        raise TypeError(f"loop must return a control system, got {'None' if loop is None else type(loop).__name__}")
+    return loop
 
 
 def check_has_inputs(loop: System) -> System:

@@ -104,6 +104,50 @@ def test_a_function_of_the_parameters_is_not_taken_for_one_of_a_plan(build):
         run(build, table)
 
 
+def of_others(k, b=1.0):
+    return cp.plants.integrator_lag_loop(k * b)
+
+
+def of_any_positions(*arguments):
+    return cp.plants.integrator_lag_loop(3.0)
+
+
+@pytest.mark.parametrize(
+    ("build", "arguments"), [(of_others, "k, b"), (of_any_positions, "arguments"), (lambda a=1, b=2: None, "a, b")]
+)
+def test_a_function_of_other_arguments_is_rejected(build, arguments):
+    said = rf"of the draws \(q\), or a function of a plan's name and the plan, got .* with the arguments {arguments}$"
+    with pytest.raises(ValueError, match=said):
+        run(build, {"q": [1.0, 2.0]})
+
+
+@pytest.mark.parametrize("build", [lambda a, b: lag(), lambda n, p, /: lag(), lambda a, b, tau=1.0, *more: lag()])
+def test_a_function_of_a_plan_may_have_arguments_of_any_name(build):
+    result = run(build, {"tau": [0.5, 1.0]})
+    np.testing.assert_allclose(result.metrics["step"]["settling_time"], np.log(50) * np.array([0.5, 1.0]), rtol=1e-5)
+
+
+def test_a_function_that_returns_no_loop_for_a_draw_is_the_failure_of_this_draw():
+    result = run(lambda tau: None if tau == 2.0 else lag(tau=tau), {"tau": [1.0, 2.0, 3.0]})
+    said = "TypeError: loop must return a control system, got None"
+    assert [(one.draw, one.message) for one in result.failures] == [(1, said)]
+
+
+@pytest.mark.parametrize("loop", [lambda name, plan: None, lambda name, plan: [lag()]])
+def test_a_function_of_a_plan_that_returns_no_loop(loop):
+    got = type(loop("", None)).__name__.removesuffix("Type")
+    with pytest.raises(TypeError, match=f"^loop must return a control system, got {got}$"):
+        run(loop, {"tau": [1.0, 2.0]})
+    with pytest.raises(TypeError, match=f"^loop must return a control system, got {got}$"):
+        cp.compare(loop, {"step": cp.Step(1.0)}, TIMES)
+
+
+def test_draws_are_no_truth_values():
+    for values in ([True, False], np.array([True, False])):
+        with pytest.raises(TypeError, match=r"draws\['tau'\] must be numbers, got truth values"):
+            run(lag(), {"tau": values})
+
+
 @pytest.mark.parametrize(
     "build",
     [lambda **values: lag(**values), lambda tau, **values: lag(tau=tau), lambda *rest, **values: lag(*rest, **values)],

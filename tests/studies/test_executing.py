@@ -330,6 +330,58 @@ def test_an_executor_that_takes_no_more_keeps_what_it_has():
     assert np.isfinite(found.metrics["step"]["settling_time"][:4]).all()
 
 
+class Empty(InTurn):
+    """Futures of some tasks have a result that no worker returns, and the tasks do not run."""
+
+    def __init__(self, empty, result):
+        super().__init__()
+        self.empty, self.result = empty, result
+
+    def run(self, k):
+        return self.result if k in self.empty else super().run(k)
+
+
+@pytest.mark.parametrize("result", [None, {}, "done"])
+def test_a_future_without_the_reply_of_a_worker_is_a_lost_task(result):
+    found = swept(lag, executor=Empty({1, 4}, result))
+    check(found, RATES)
+    assert (found.failures, found.sent_again, found.missing) == ((), (1.0, 2.5), ())
+    never = swept(lag, executor=Empty({1, 6, 7}, result))  # the second value each time
+    assert [(f.draw, f.params) for f in never.failures] == [(1, {"value": 1.0})]
+    said = "RuntimeError: the executor must return the result of the function submitted, got "
+    assert never.failures[0].message == f"{said}{result!r}"
+    assert (never.sent_again, never.missing) == ((1.0,), (1.0,))
+
+
+class Unreachable(InTurn):
+    """`submit` raises an OSError at some of its calls."""
+
+    def __init__(self, calls):
+        super().__init__()
+        self.calls, self.count = calls, 0
+
+    def submit(self, function, /, *arguments):
+        self.count += 1
+        if self.count in self.calls:
+            raise ConnectionResetError("reset")
+        return super().submit(function, *arguments)
+
+
+@pytest.mark.parametrize("calls", [{1}, {3}, {2, 5}])
+def test_a_connection_error_of_submit_is_retried_once(calls):
+    found = swept(lag, executor=Unreachable(calls))
+    check(found, RATES)
+    assert (found.failures, found.missing) == ((), ())
+
+
+def test_after_two_connection_errors_of_submit_the_rest_is_given_up():
+    executor = Unreachable({5, 6})
+    found = swept(lag, executor=executor)
+    said = "ConnectionResetError: reset"
+    assert [(f.draw, f.message) for f in found.failures] == [(4, said), (5, said)]
+    assert executor.count == 6
+
+
 # What a run or a builder does
 
 

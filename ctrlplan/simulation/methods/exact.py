@@ -12,13 +12,14 @@ from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array
 from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.exact import Jet, exact_states, sampled_states
+from ctrlplan.simulation.held_outputs import of_delayed, of_sampled
 from ctrlplan.simulation.job import Job, Record, with_event_times
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.moments import moment_states
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.sampled_form import DelayedForm, SampledForm
 from ctrlplan.simulation.sampled_motion import moved_signals
-from ctrlplan.simulation.segments import check_periods
+from ctrlplan.simulation.segments import check_periods, time_tolerance
 from ctrlplan.simulation.signals import PlanSignal, SampledSignal, signal_values
 from ctrlplan.trajectories import Trajectory
 
@@ -91,8 +92,16 @@ def _run_sampled(job: Job, form: SampledForm) -> Record:
         w = signal_values(time_signals, times)
         floor = 64.0 * np.finfo(float).eps * (np.abs(form.c) @ np.abs(z) + np.abs(form.d) @ np.abs(w)).max(axis=1)
         _warn_of_uncertainty(job, form.c @ z + form.d @ w, form.c @ nearly + form.d @ w, floor)
-    states = z[:n]
-    return Record(times, states, snapshot, interpolate, watched, Exact.name, "linear, with discrete blocks or delays")
+    return Record(
+        times,
+        z[:n],
+        snapshot,
+        interpolate,
+        watched,
+        Exact.name,
+        "linear, with discrete blocks or delays",
+        held=lambda: of_sampled(form, time_signals, motion.instants.times, last, motion.tolerance, motion.at),
+    )
 
 
 def _run_delayed(job: Job, form: DelayedForm) -> Record:
@@ -114,7 +123,18 @@ def _run_delayed(job: Job, form: DelayedForm) -> Record:
     def interpolate(k: int, t: float) -> Array:
         return motion.at(np.array([t]))[0][:, 0]
 
-    return Record(times, motion.at(times)[0], snapshot, interpolate, watched, Exact.name, "linear, with delays")
+    last = float(times[-1])
+    tolerance = time_tolerance(job.first, last)
+    return Record(
+        times,
+        motion.at(times)[0],
+        snapshot,
+        interpolate,
+        watched,
+        Exact.name,
+        "linear, with delays",
+        held=lambda: of_delayed(form, motion.instants, last, tolerance, motion.at),
+    )
 
 
 def _run(job: Job, form: LinearForm) -> Record:
