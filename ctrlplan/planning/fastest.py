@@ -529,11 +529,15 @@ def _with_given_speeds(plan: Trajectory, limited: Limited, span: tuple[float, fl
     _check_signs(plan, limited, given=True)
     begun = plan.shift(-plan.start)  # the values of the time law are times
 
+    statements: list[str] = []
+
     def law(reserve: float) -> Trajectory:
-        return law_with_given_ends(begun, limited, plan.start, reserve).shift(plan.start)
+        found = law_with_given_ends(begun, limited, plan.start, reserve)
+        statements.append(_GIVEN if found is begun else _LOCAL)
+        return found.shift(plan.start)
 
     found, margins = _with_reserves(plan, limited, span, law)
-    return Fastest(found, margins, ((found.duration, found.duration),), "path", limited, statement=_LOCAL)
+    return Fastest(found, margins, ((found.duration, found.duration),), "path", limited, statement=statements[-1])
 
 
 def _check_waypoints(plan: WaypointSpline, limited: Limited) -> None:
