@@ -528,7 +528,6 @@ def _with_given_speeds(plan: Trajectory, limited: Limited, span: tuple[float, fl
     _check_rest(plan, limited)
     _check_signs(plan, limited, given=True)
     begun = plan.shift(-plan.start)  # the values of the time law are times
-
     statements: list[str] = []
 
     def law(reserve: float) -> Trajectory:

@@ -173,23 +173,6 @@ def simulate(
     return response_to(job, chosen)
 
 
-def simulate_with_later_events(
-    system: System | Prepared,
-    timepts: ArrayLike,
-    inputs: Inputs = None,
-    initial_state: ArrayLike | None = None,
-    *,
-    params: Mapping[str, object] | None = None,
-    events: Events = None,
-) -> tuple[SimulationResponse, Occurrence | None]:
-    """Time response as by `simulate`, and the event that ends it.
-
-    Other events are located when they are first read, if that calls no functions of
-    the user: many runs are wanted for their metrics only.
-    """
-    return simulate_for_metrics(system, timepts, inputs, initial_state, params=params, events=events)[:2]
-
-
 def simulate_for_metrics(
     system: System | Prepared,
     timepts: ArrayLike,
@@ -199,7 +182,11 @@ def simulate_for_metrics(
     params: Mapping[str, object] | None = None,
     events: Events = None,
 ) -> tuple[SimulationResponse, Occurrence | None, HeldOutputs | None]:
-    """The same, and the parts of the outputs that discrete blocks hold; None if there are none."""
+    """Time response as by `simulate`, the event that ends it, and the held parts of its outputs; None without any.
+
+    Other events are located when they are first read, if that calls no functions of
+    the user: many runs are wanted for their metrics only.
+    """
     job = checked_job(system, timepts, inputs, initial_state, params=params, events=events)
     warn_of_unread(job.prepared, job.params)
     warn_of_timebase(job.prepared)

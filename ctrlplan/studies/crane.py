@@ -13,7 +13,7 @@ from ctrlplan import metrics
 from ctrlplan.planning import Fastest, avoid, plan_length
 from ctrlplan.simulation import simulate
 from ctrlplan.simulation.built_forms import shared_forms
-from ctrlplan.simulation.simulate import simulate_with_later_events
+from ctrlplan.simulation.simulate import simulate_for_metrics
 from ctrlplan.studies.choosing import (
     LOAD_RADIUS,
     MARGIN,
@@ -289,7 +289,7 @@ def _limited_error(run: Run, options: _Loop, timepts: Array) -> float:
     response = run.response
     if "force_limits" not in options and _reaches_limits(run):
         loop = crane_loop(CRANE, run.plan, **options | {"force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS})
-        response, _ = simulate_with_later_events(loop, timepts, events=(SLACK,))
+        response = simulate_for_metrics(loop, timepts, events=(SLACK,))[0]
     if response.time[-1] < timepts[-1]:
         return np.nan
     signals = signals_of(response)

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 import ctrlplan as cp
 from ctrlplan.simulation import Event, Occurrence
 from ctrlplan.simulation.events import Watched, crossings
-from ctrlplan.simulation.simulate import simulate_with_later_events
+from ctrlplan.simulation.simulate import simulate_for_metrics
 
 METHODS = ("exact", "compiled", "python")
 ALLOWED = {"exact": 1e-12, "compiled": 1e-7, "python": 1e-7}
@@ -394,7 +394,7 @@ def limited():
 def test_events_read_later_are_those_of_simulate(stop):
     events = [Event("y", high=0.9, stop=stop), Event("y", low=0.25, high=0.75)]
     now = cp.simulate(limited(), T, 1.0, events=events)
-    later, end = simulate_with_later_events(limited(), T, 1.0, events=events)
+    later, end, _ = simulate_for_metrics(limited(), T, 1.0, events=events)
     assert now.method == later.method == "compiled"
     copied = pickle.loads(pickle.dumps(later))
     assert told(later) == told(copied) == told(now)
@@ -414,7 +414,7 @@ def test_functions_of_the_user_are_not_called_later():
         calls.append(t.size)
         return y[0]
 
-    found, _ = simulate_with_later_events(limited(), T, 1.0, events=[Event(height, high=0.5)])
+    found, *_ = simulate_for_metrics(limited(), T, 1.0, events=[Event(height, high=0.5)])
     count = len(calls)
     assert count
     assert found.events

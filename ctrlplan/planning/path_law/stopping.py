@@ -61,8 +61,8 @@ def stopping(plan: Trajectory, order: int, lap: bool) -> tuple[Trajectory, tuple
     ends = closing if own.is_cyclic else None
     joints_and_ends: list[Joint | None] = [ends, *joints, ends]
     times = [float(own.breakpoints[span.segment] + span.start) for span in spans] + [own.end]
-    beside = zip([None, *spans], [*spans, None], joints_and_ends, strict=True)
-    points = [_point(before, after, joint, order) for before, after, joint in beside]
+    around = zip([None, *spans], [*spans, None], joints_and_ends, strict=True)
+    points = [_point(before, after, joint, order) for before, after, joint in around]
     chosen = [k for k, point in enumerate(points) if point != _Point() or k in (0, len(spans))]
     rows, lengths, rate = [], [], 1.0
     for j, k in pairwise(chosen):
