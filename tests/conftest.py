@@ -42,10 +42,11 @@ def pytest_addoption(parser):
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(config, items):
     """Of all combinations of several lists of cases, those not needed to have each case of each list once are slow,
-    and an eighth of them is run.
+    and an eighth of them is run. Of the cases of a test that are left, a third is everyday.
     """
+    ours = [item for item in items if HERE in item.path.parents]  # another package's tests are all run
     families = {}
-    for item in (item for item in items if HERE in item.path.parents):  # another package's tests are all run
+    for item in ours:
         if len(lists := list(item.iter_markers("parametrize"))) > 1:
             values = {(names, _case(item, names)) for names in map(_names, lists)}
             families.setdefault(item.nodeid.partition("[")[0], []).append((item, values))
@@ -64,6 +65,22 @@ def pytest_collection_modifyitems(config, items):
     if left_out and not config.getoption("all_combinations", False):
         config.hook.pytest_deselected(items=list(left_out))
         items[:] = [item for item in items if item not in left_out]
+    _leave_a_third(ours)
+
+
+def _leave_a_third(items):
+    """Make slow two thirds of the cases of each test that has more than two: the same in all tests of a file, which
+    share what they compute for a case.
+    """
+    tests = {}
+    for item in items:
+        if not any(map(item.get_closest_marker, ("slow", "every_combination"))):
+            tests.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    for name, cases in tests.items():
+        first = zlib.crc32(name.partition("::")[0].encode()) % 3
+        for k, item in enumerate(cases if len(cases) > 2 else ()):
+            if k % 3 != first:
+                item.add_marker("slow")
 
 
 def _choose(cases, known, chosen):

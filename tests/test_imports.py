@@ -10,6 +10,8 @@ import pytest
 
 import ctrlplan as cp
 
+pytestmark = pytest.mark.every_combination
+
 ROOT = Path(cp.__file__).parent
 PROJECT = ROOT.parent
 TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(encoding="utf-8")) for path in ROOT.rglob("*.py")}

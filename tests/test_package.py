@@ -17,6 +17,8 @@ from strict import WARNINGS
 
 import ctrlplan as cp
 
+pytestmark = pytest.mark.every_combination
+
 ROOT = Path(cp.__file__).parent
 PROJECT = ROOT.parent
 SUBPACKAGES = sorted(m.name for m in pkgutil.walk_packages(cp.__path__, "ctrlplan.") if m.ispkg and "._" not in m.name)

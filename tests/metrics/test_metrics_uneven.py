@@ -44,6 +44,7 @@ def test_a_staircase_with_samples_before_and_after_each_jump(count, gap):
     assert total_variation(times, u) == pytest.approx(np.abs(np.diff(levels)).sum(), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_no_cubic_is_farther_from_the_samples_than_these_are_apart():
     rng = np.random.default_rng(0)
     for _ in range(300):

@@ -92,6 +92,7 @@ def test_with_limits_of_the_jerk_and_given_speeds(width):
     assert shortest <= given.duration <= 1.1 * shortest
 
 
+@pytest.mark.slow
 def test_limits_that_cannot_be_resolved_are_satisfied_with_a_warning():
     with pytest.warns(
         UserWarning, match=r"the plan is slowed by the factor .* limits over time change within a short part"

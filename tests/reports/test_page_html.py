@@ -31,6 +31,7 @@ def number(text):
 # The document
 
 
+@pytest.mark.slow
 def test_the_document_is_whole(written, page):
     assert written.html.lstrip().lower().startswith("<!doctype html>")
     assert page.attributes["declared"] == ["DOCTYPE html"]

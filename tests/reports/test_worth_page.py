@@ -143,6 +143,7 @@ def test_without_units_there_are_no_brackets(shown, study):
 # Benefit of planning
 
 
+@pytest.mark.slow
 def test_all_baselines_are_in_the_table_of_the_section(study, page):
     (beside,) = tables(page, "baselines")
     assert titles(beside) == ["metric", "unit", *study.comparison.benefit.comparison.plans, "worst to best"]

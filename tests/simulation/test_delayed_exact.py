@@ -323,6 +323,7 @@ def test_the_unit_of_time_does_not_matter(unit):
     assert np.abs(found.outputs - sum(terms)).max() <= 1e-13
 
 
+@pytest.mark.slow
 def test_runs_of_one_form_do_not_depend_on_earlier_ones():
     """Cells are kept for runs with the same times; other plans, starts, ends and initial states, in threads as well."""
     times = np.linspace(0.0, 6.0, 61)

@@ -157,6 +157,7 @@ def integral_of_cosine(distance, times):
     return np.interp(times, edges, total)
 
 
+@pytest.mark.slow
 def test_a_run_begins_with_the_tolerances_that_one_of_an_equal_loop_required(monkeypatch):
     runs, go = [], numerical.Attempt.go
     monkeypatch.setattr(numerical.Attempt, "go", lambda self: runs.append(self) or go(self))

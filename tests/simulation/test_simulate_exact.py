@@ -72,6 +72,7 @@ def test_many_constraints(npoints, nentries, alpha):
     check(lag_loop(5.0), plan, signals, np.linspace(0.0, 20.0, 83))
 
 
+@pytest.mark.slow
 def test_the_obstacle_plan_of_simulation_3():
     x = [[0.0, 0.0, 0.0], [5.0, 1.0, 0.1], [15.0, 2.0, 0.1], [20.0, 0.0, 0.0]]
     z = [[10.0, 0.0, 0.0], [5.0, -1.0, -0.15], [5.0, 1.0, 1.0], [11.0, 0.0, 0.0]]

@@ -227,6 +227,7 @@ def test_a_parameter_that_counts_only_beyond_a_limit_is_run_too(tau):
     np.testing.assert_allclose(result.bands["step"]["y"][:, -1], ends, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_notes_tell_of_failures(exploded):
     assert list(exploded.notes())[:3] == [
         "4 draws: k 0.01 to 0.5. The responses below are those of the nominal loop.",

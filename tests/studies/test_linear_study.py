@@ -58,6 +58,7 @@ def test_the_study_is_the_one_of_the_paper(study):
     np.testing.assert_allclose(row, TABLE[5], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_sweep_runs_from_one_end_to_the_other(study):
     gains = study.sections[0].sweep.values
     assert study.sections[0].sweep.parameter == "gain"

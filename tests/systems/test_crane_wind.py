@@ -300,6 +300,7 @@ def test_a_loop_in_the_wind_against_its_equations_by_hand(blown, wrap, law, meth
 
 
 @pytest.mark.parametrize("law", [law for _, law in CASES])
+@pytest.mark.slow
 def test_compiled_and_python_agree_in_the_wind(blown, law):
     first, second = (np.asarray(blown[law, method].outputs) for method in METHODS)
     size = np.abs(first).max(axis=1, keepdims=True)
