@@ -127,20 +127,25 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     if even:  # spacings that differ only by rounding share an exponential
         steps[:] = even
     terms = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms, in units of each interval
-    part = max(1, _NUMBERS // max(1, scale.size * (scale.size + terms.shape[1])))
+    n = scale.size
+    part = max(1, _NUMBERS // max(1, n * (n + 1 if even else n + terms.shape[1])))
     with np.errstate(all="ignore"):
-        if even and scale.size > _CROSSOVER:
+        if even and n > _CROSSOVER:
             out[:] = _marched(state, changes_over(even * a, even * b, 2), terms.T.reshape(2, len(samples), -1))[0].T
             return (out * scale).T
-        for begin in range(0, steps.size if scale.size else 0, part):
+        for begin in range(0, steps.size if n else 0, part):
             these = slice(begin, begin + part)
             spacings, which = np.unique(steps[these], return_inverse=True)
             h = spacings[:, None, None]
             changes = changes_over(h * a, h * b, 2)
-            change = changes[-1][which]
-            forced = change[:, :, scale.size :] @ terms[these, :, None]
+            if spacings.size == 1:
+                change = np.broadcast_to(changes[-1][:, :, :n], (which.size, n, n))
+                forced = terms[these] @ changes[-1][0, :, n:].T
+            else:
+                change = changes[-1][which]
+                forced = (change[:, :, n:] @ terms[these, :, None])[:, :, 0]
             found = out[begin + 1 : these.stop + 1]
-            found[:] = _recurrence(change[:, :, : scale.size], forced, out[begin])
+            found[:] = _recurrence(change[:, :, :n], forced, out[begin])
             for k in range(_first_overflow(found.T), len(found)):
                 series, own = terms[begin + k].reshape(2, -1, 1), [level[which[k]] for level in changes]
                 found[k] = _propagated(out[begin + k][:, None], series, own)[:, 0]
@@ -379,19 +384,19 @@ def changes_over(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Arr
     n = a.shape[1]
     own = np.array([change[..., :n] for change in found])
     cancelled = np.any(_cancelling(own[:-1], own[:-1], own[1:]), axis=0, out=np.zeros(len(a), dtype=bool))
-    large = np.abs(products[:, :, :n, 0]).sum(axis=1).max(axis=1) > 0.25 * _CANCELLED
+    large = np.abs(products[0, :, :, :n]).sum(axis=1).max(axis=1) > 0.25 * _CANCELLED
     if large.any():
-        powers = np.moveaxis(products[large, :, :n], -1, 0)
+        powers = products[:, large, :, :n]
         cancelled[large] |= np.any(_cancelling(powers[:1], powers[:-1], powers[1:]), axis=0)
     if cancelled.any():
-        precise = _doubled_precisely(products[cancelled, :, :, 0], minimum[cancelled], nterms, levels)
+        precise = _doubled_precisely(products[0, cancelled], minimum[cancelled], nterms, levels)
         for change, better in zip(found, precise, strict=True):
             change[cancelled] = np.where(np.isfinite(better).all(axis=(1, 2), keepdims=True), better, change[cancelled])
     return found
 
 
 def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Products a^k [a, b] (nsystems, n, n + ninputs, nproducts) over a time of 2^-halvings, and halvings (nsystems,).
+    """Products a^k [a, b] (nproducts, nsystems, n, n + ninputs) over a time of 2^-halvings, and halvings (nsystems,).
 
     The number of halvings ensures convergence of the Taylor series: the roots of
     the norms of the powers of the matrix are at most 1. For a nonnormal matrix
@@ -403,30 +408,32 @@ def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
     if not (np.isfinite(norm).all() and np.isfinite(b).all()):
         raise ValueError("the system matrices A and B times the duration must be below 1e308, got an overflow")
     halvings = np.ceil(np.log2(np.maximum(norm, 1.0)))
+    n = a.shape[1]
     both = np.concatenate([a, b], axis=2) * 0.5 ** halvings[:, None, None]
-    n, products = a.shape[1], [both]
-    for _ in range(_POWERS):
-        products.append(both[..., :n] @ products[-1])
+    products = np.empty((_TERMS + 1, *both.shape))
+    products[0] = both
+    for k in range(_POWERS):
+        np.matmul(both[..., :n], products[k], out=products[k + 1])
     if halvings.any():
-        sizes = np.abs(products)[..., :n].sum(axis=2).max(axis=2)
+        sizes = np.abs(products[: _POWERS + 1, ..., :n]).sum(axis=2).max(axis=2)
         roots = sizes ** (1.0 / np.arange(1.0, _POWERS + 2.0)[:, None])
         root = np.maximum(roots[:-1], roots[1:]).min(axis=0)
         # The bounds prevent overflow of the products and of scaled rounding errors.
         saved = np.floor(-np.log2(np.clip(root, 2.0**-50, 1.0))) * (np.abs(b).max(axis=(1, 2), initial=0.0) < 1e200)
         saved = np.minimum(saved, halvings)
         halvings, factor = halvings - saved, 2.0 ** saved[:, None, None]
-        products = [product * factor ** (k + 1.0) for k, product in enumerate(products)]
-        both = products[0]
-    while len(products) <= _TERMS:
-        products.append(both[..., :n] @ products[-1])
-    return np.stack(products, axis=-1), halvings.astype(np.intp)
+        for k in range(_POWERS + 1):
+            products[k] *= factor ** (k + 1.0)
+    for k in range(_POWERS, _TERMS):
+        np.matmul(products[0, ..., :n], products[k], out=products[k + 1])
+    return products, halvings.astype(np.intp)
 
 
 def _doubled(products: Array, minimum: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
     """Changes over 2^-levels, ..., 1/2, 1 units of time: by the series up to 2^-minimum, then by squaring."""
-    n, m = products.shape[1], products.shape[2] - products.shape[1]
+    n, m = products.shape[2], products.shape[3] - products.shape[2]
     shift, powers = _shift(nterms, m, 1.0), np.repeat(0.5 ** np.arange(nterms), m)
-    orders = np.arange(1.0, products.shape[3] + 1.0)
+    orders = np.arange(1.0, len(products) + 1.0)[:, None, None, None]
     found: list[Array] = []
     for level in range(levels, -1, -1):
         change, squared = np.empty((len(minimum), n, n + nterms * m)), minimum > level
@@ -436,11 +443,11 @@ def _doubled(products: Array, minimum: NDArray[np.intp], nterms: int, levels: in
             after[..., n:] *= powers
             change[squared] = after
         if not squared.all():
-            terms, shorter = (products, minimum) if not squared.any() else (products[~squared], minimum[~squared])
+            terms, shorter = (products, minimum) if not squared.any() else (products[:, ~squared], minimum[~squared])
             if (shorter < level).any():
-                terms = terms * (0.5 ** (level - shorter[:, None, None, None])) ** orders
+                terms = terms * (0.5 ** (level - shorter[:, None, None])) ** orders
             # einsum gives equal sums for equal rows, which matmul does not guarantee.
-            sums = np.einsum("rk,jk->rj", terms.reshape(-1, orders.size), _WEIGHTS[:nterms])
+            sums = np.einsum("kr,jk->rj", terms.reshape(orders.size, -1), _WEIGHTS[:nterms])
             change[~squared] = _arranged(sums, n, m)
         found.append(change)
     return found
@@ -516,11 +523,14 @@ def _marched(state: Array, changes: list[Array], series: Array) -> Array:
     (count, n), ncells = state.shape, series.shape[2]
     rows = np.empty((ncells + 1, count, n))
     rows[0] = state
-    change = changes[-1][..., :n]
+    change = changes[-1][..., :n].copy()  # products with aligned rows are faster
     forced = np.moveaxis(changes[-1][..., n:] @ series.reshape(-1, ncells), 2, 0).copy()
-    for k in range(ncells):
-        state = state + ((change @ state[:, :, None])[:, :, 0] + forced[k])
-        rows[k + 1] = state
+    if count == 1:
+        rows[1:, 0] = _one_by_one(np.broadcast_to(change, (ncells, n, n)), forced[:, 0], state[0])
+    else:
+        for k in range(ncells):
+            state = state + ((change @ state[:, :, None])[:, :, 0] + forced[k])
+            rows[k + 1] = state
     states = np.moveaxis(rows, 0, 2)
     for i in _overflowed(states):
         found = states[i]
@@ -573,17 +583,17 @@ def _propagated(states: Array, series: Array, changes: list[Array]) -> Array:
 
 
 def _recurrence(change: Array, forced: Array, state: Array) -> Array:
-    """States (nsteps, n) after each of the steps x + change x + forced, shapes (nsteps, n, n) and (nsteps, n, 1).
+    """States (nsteps, n) after each of the steps x + change x + forced, shapes (nsteps, n, n) and (nsteps, n).
 
     For few states in sqrt(nsteps) blocks: the affine map of each block is
     computed for all blocks together, then the state from block to block.
     """
-    nsteps, n = change.shape[:2]
+    nsteps, n = forced.shape
     if n > _CROSSOVER:
         return _one_by_one(change, forced, state)
     per = int(np.ceil(nsteps**0.5))
     steps = np.zeros((per * -(-nsteps // per), n, n + 1))
-    steps[:nsteps, :, :n], steps[:nsteps, :, n:] = change, forced
+    steps[:nsteps, :, :n], steps[:nsteps, :, n] = change, forced
     steps = steps.reshape(-1, per, n, n + 1)
     for j in range(1, per):
         before = steps[:, j - 1]
@@ -601,10 +611,12 @@ def _recurrence(change: Array, forced: Array, state: Array) -> Array:
 
 def _one_by_one(change: Array, forced: Array, state: Array) -> Array:
     """The same, one step after the other."""
-    found = np.empty(change.shape[:2])
-    for k in range(len(found)):
-        state = state + (change[k] @ state + forced[k, :, 0])
-        found[k] = state
+    found = np.empty(forced.shape)
+    for own, given, after in zip(change, forced, found, strict=True):
+        own.dot(state, out=after)
+        after += given
+        after += state
+        state = after
     return found
 
 

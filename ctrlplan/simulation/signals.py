@@ -227,8 +227,15 @@ class SampledSignal:
 
     def __init__(self, times: Array, values: Array) -> None:
         self.times, self.values = times, values
-        self._ends = _ends_of_lines(times, values)
-        self._knots = times[self._ends]
+
+    @cached_property
+    def _ends(self) -> NDArray[np.intp]:
+        """Indices of the samples at the ends of lines, which a linear loop does not need."""
+        return _ends_of_lines(self.times, self.values)
+
+    @cached_property
+    def _knots(self) -> Array:
+        return self.times[self._ends]
 
     def breakpoints_between(self, t0: float, t1: float) -> Array:
         """Samples at which the slope changes."""
@@ -252,6 +259,8 @@ class SampledSignal:
 
     def at(self, times: Array) -> Array:
         """Interpolated values."""
+        if times is self.times:
+            return self.values[None]
         after = np.clip(np.searchsorted(self.times, times, side="right"), 1, self.times.size - 1)
         first, second = self.values[after - 1], self.values[after]
         found = np.interp(times, self.times, self.values)
@@ -371,6 +380,8 @@ def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[T
         rows = rows[None] if rows.ndim == 1 and len(labels) == 1 else rows
         if rows.shape not in ((len(labels), times.size), (len(labels),)):
             raise ValueError(f"inputs must have shape ({len(labels)}, {times.size}), got {rows.shape}")
+        if rows.ndim == 2 and np.isfinite(rows).all():
+            return [SampledSignal(times, row) for row in rows]
         given = list(rows)
     return [_time_signal(value, name, times) for value, name in zip(given, labels, strict=True)]
 

@@ -70,12 +70,9 @@ def test_many_states_and_segments(states, segments, benchmark, capsys, monkeypat
         )
 
 
-@pytest.mark.benchmark
-@pytest.mark.parametrize("states", [4, 20, 100, 200])
-def test_samples_as_input(states, benchmark, capsys):
-    """Random samples connected by straight lines, as by the peer. Goal: at most 1."""
-    system = chain(states // 2)
-    ready, samples = cp.prepare(system), np.random.default_rng(0).standard_normal(T.size)
+def beside_peer(system, samples, benchmark, capsys):
+    """Print the ratio of CPU times at the times T, interleaved, and check that both responses are equal."""
+    ready = cp.prepare(system)
 
     def ours():
         return cp.simulate(ready, T, samples)
@@ -85,7 +82,7 @@ def test_samples_as_input(states, benchmark, capsys):
 
     benchmark.pedantic(ours, rounds=3, warmup_rounds=1)
     rows = []
-    for _ in range(2 * ROUNDS):
+    for _ in range(3 * ROUNDS):
         seconds, results = [], []
         for function in (ours, peer):
             begin = process_time()
@@ -96,4 +93,31 @@ def test_samples_as_input(states, benchmark, capsys):
     benchmark.extra_info["ratio"] = own / other
     assert np.abs(results[0] - results[1]).max() <= 1e-11 * np.abs(results[1]).max()
     with capsys.disabled():
-        print(f"\n{states} states, samples: {1e3 * own:.1f} ms, peer {1e3 * other:.1f} ms, ratio {own / other:.2f}")
+        print(
+            f"\n{system.nstates} states, samples of {system.ninputs} inputs: {1e3 * own:.1f} ms, peer "
+            f"{1e3 * other:.1f} ms, ratio {own / other:.2f}"
+        )
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("states", [4, 20, 100, 200])
+def test_samples_as_input(states, benchmark, capsys):
+    """Random samples connected by straight lines, as by the peer. Goal: at most 1."""
+    beside_peer(chain(states // 2), np.random.default_rng(0).standard_normal(T.size), benchmark, capsys)
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("kind", ["random", "smooth"])
+@pytest.mark.parametrize(
+    ("states", "inputs", "outputs"),
+    [(2, 100, 2), (4, 20, 5), (4, 20, 200), (9, 20, 5), (30, 20, 5), (60, 20, 60), (2, 300, 2)],
+)
+def test_samples_of_many_inputs(states, inputs, outputs, kind, benchmark, capsys):
+    """The same for many inputs and outputs, with samples that are random or of sine waves. Goal: at most 1."""
+    rng = np.random.default_rng(1)
+    a = rng.standard_normal((states, states)) / states**0.5
+    a -= (np.linalg.eigvals(a).real.max() + 0.3) * np.eye(states)
+    system = ct.ss(a, rng.standard_normal((states, inputs)), rng.standard_normal((outputs, states)), 0)
+    rates = 0.05 * (1.0 + np.arange(inputs))[:, None]
+    samples = np.sin(rates * T) if kind == "smooth" else rng.standard_normal((inputs, T.size))
+    beside_peer(system, samples, benchmark, capsys)

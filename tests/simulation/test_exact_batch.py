@@ -4,6 +4,7 @@ import control as ct
 import mpmath as mp
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from simulation_oracle import both, gap, lag_loop, polygon, response, step
 
 import ctrlplan as cp
@@ -253,6 +254,24 @@ def test_next_to_forced_response():
     t, u = np.linspace(0.0, 10.0, 1001), rng.normal(size=(2, 1001))
     found = sampled_states(system.A, system.B, u, t, np.array([1.0, -1.0]))
     assert gap(found, ct.forced_response(system, t, u, [1.0, -1.0]).states) <= 1e-10
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 150), (2, 100), (8, 20), (9, 20), (40, 60)])
+@pytest.mark.parametrize("even", [True, False])
+def test_samples_of_many_inputs(even, n, m):
+    rng = np.random.default_rng([n, m])
+    a, b, initial = rng.normal(size=(n, n)) / n**0.5 - np.eye(n), rng.normal(size=(n, m)), rng.normal(size=n)
+    t = np.linspace(0.0, 3.0, 31) if even else np.sort(rng.uniform(0.0, 3.0, 31))
+    u = np.where(np.arange(m)[:, None] % 2, rng.normal(size=(m, 31)), np.sin(t + np.arange(m)[:, None]))
+    states, zero = [initial], np.zeros((m, n))
+    for k, h in enumerate(np.diff(t)):  # state, input and change of the input form one system without input
+        whole = np.block([[a * h, b * h, 0 * b], [zero, np.zeros((m, m)), np.eye(m)], [zero, np.zeros((m, 2 * m))]])
+        states.append((expm(whole) @ np.concatenate([states[-1], u[:, k], u[:, k + 1] - u[:, k]]))[:n])
+    found = sampled_states(a, b, u, t, initial)
+    assert gap(found, np.transpose(states)) <= SMALL
+    system = ct.ss(a, b, np.eye(n), 0)
+    assert np.array_equal(cp.simulate(system, t, u, initial).states, found)
+    assert np.array_equal(cp.simulate(system, t, list(u), initial).states, found)
 
 
 def test_samples_without_states_or_inputs():

@@ -141,12 +141,8 @@ def _run(job: Job, form: LinearForm) -> Record:
     time_signals = [*job.inputs, *(PlanSignal(plan, high) for plan, high in form.sources)]
     planned = [signal for signal in time_signals if isinstance(signal, PlanSignal)]
     plans = [(signal.plan, signal.derivatives) for signal in planned]
-    sampled = (
-        np.concatenate(
-            [np.full(signal.width, isinstance(signal, SampledSignal)) for signal in time_signals] or [np.zeros(0)]
-        )
-        > 0
-    )
+    kinds, widths = [isinstance(signal, SampledSignal) for signal in time_signals], [s.width for s in time_signals]
+    sampled = np.repeat(np.array(kinds, dtype=bool), widths)
     first, last = float(job.times[0]), float(job.times[-1])
     breakpoints = [t for plan, _ in plans for t in plan.breakpoints_between(first, last)]
     watched = job.watched()
