@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from numbers import Real
 from typing import Any
@@ -257,6 +257,18 @@ def check_kind(value: object, name: str, kind: type, what: str = "") -> None:
     """Raise unless a value is an object of a class, described as `what` in messages."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be {what or f'a {kind.__name__}'}, got {type(value).__name__}")
+
+
+def checked_params(params: object) -> dict[str, Any]:
+    """Parameters of blocks by name, none for None."""
+    if params is None:
+        return {}
+    check_kind(params, "params", Mapping, "a mapping of names to values, such as {'mass': 2.0}")
+    given: Mapping[Any, Any] = params  # type: ignore[assignment]
+    for name in given:
+        if not isinstance(name, str):
+            raise TypeError(f"params must have names as keys, such as 'mass', got {name!r:.80}")
+    return dict(given)
 
 
 def _has_mask(values: Any) -> bool:

@@ -18,8 +18,8 @@ CHECKS = {
     for name, function in vars(_checks).items()
     if inspect.isfunction(function) and not name.startswith("_") and function.__module__ == _checks.__name__
 }
-NAMELESS = {"checked_labels", "default_labels"}
-"""What is always called labels."""
+NAMELESS = {"checked_labels", "checked_params", "default_labels"}
+"""What is always called labels or params."""
 
 
 @pytest.mark.parametrize("check", [CHECKS[name] for name in sorted(set(CHECKS) - NAMELESS)])

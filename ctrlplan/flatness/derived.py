@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import checked_finite
+from ctrlplan._checks import checked_finite, checked_params
 from ctrlplan._display import Facts, Part
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Params, Value
@@ -334,7 +334,7 @@ class DerivedFlatSystem(FlatSystem):
 
     def _values(self, params: Mapping[str, float] | None) -> Array:
         """Parameters in the order of the maps."""
-        given = {**self.params, **(params or {})}
+        given = {**self.params, **checked_params(params)}
         for name in given:
             if name not in self._names:
                 known = ", ".join(self._names) or "none"

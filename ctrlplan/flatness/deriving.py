@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import control as ct
 import numpy as np
 
-from ctrlplan._checks import check_kind, checked_finite
+from ctrlplan._checks import check_kind, checked_finite, checked_params
 from ctrlplan._types import Array, Params, System
 from ctrlplan.flatness.derived import DerivedFlatSystem
 from ctrlplan.flatness.errors import NotFlatError
@@ -109,15 +109,13 @@ def flat_system(
         raise ImportError(f"flat_system requires CasADi: {missing}")
     from ctrlplan.flatness.analysis import analysed
 
-    plant = _state_space(system)
-    for key, value in dict(params or {}).items():
+    plant, own = _state_space(system), checked_params(params)
+    for key, value in own.items():
         if isinstance(value, Real):
             checked_finite(value, f"params[{key!r}]")
 
     def derived(outputs: FlatOutputs) -> DerivedFlatSystem:
-        analysis, original = analysed(
-            plant, outputs, inputs=inputs, at=at, params=dict(params or {}), scales=dict(scales or {})
-        )
+        analysis, original = analysed(plant, outputs, inputs=inputs, at=at, params=own, scales=dict(scales or {}))
         return derived_system(analysis, original, name or str(system.name))
 
     if flat_outputs is not None:

@@ -10,7 +10,15 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import check_kind, checked_labels, checked_timepts, default_labels, finite_vector, real_array
+from ctrlplan._checks import (
+    check_kind,
+    checked_labels,
+    checked_params,
+    checked_timepts,
+    default_labels,
+    finite_vector,
+    real_array,
+)
 from ctrlplan._display import Displayed, Facts, Part, time_text
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Value
@@ -130,7 +138,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
             inputs=list(inputs),
             outputs=list(outputs),
             name=name,
-            params=dict(params or {}),
+            params=checked_params(params),
         )
         self.orders = tuple(orders)
         self.extension = sum(self.orders) - len(states)

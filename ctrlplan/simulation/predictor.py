@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import Range, check_signals, checked_finite, checked_limits
+from ctrlplan._checks import Range, check_signals, checked_finite, checked_limits, checked_params
 from ctrlplan._display import Displayed, Facts, Part, Table, number
 from ctrlplan._types import Array, Frozen, Params, System
 from ctrlplan.simulation import methods
@@ -162,7 +162,7 @@ class Predictor(Displayed, Frozen):
             _high=bounds[:, 1] - inset,
             _inset=inset,
             _resolution=float(resolution),
-            _params=dict(params or {}),
+            _params=checked_params(params),
         )
 
     def _describe(self) -> Iterator[Part]:

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import real_array
+from ctrlplan._checks import checked_params, real_array
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params, System
 from ctrlplan.simulation import methods
@@ -220,11 +220,12 @@ def checked_job(
     for label, value in tolerances.items():
         if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 < float(value) < math.inf:
             raise ValueError(f"{label} must be a finite number above 0, got {value!r}")
+    given = checked_params(params)
     prepared = prepared_form(system)
     signals = input_signals(prepared.input_labels, inputs, times)
     state = checked_state(prepared, initial_state)
     check_begin(prepared.starts, float(times[0]), initial_state is None)
-    return Job(prepared, times, signals, state, dict(params or {}), rtol, atol, events, prepared.network)
+    return Job(prepared, times, signals, state, given, rtol, atol, events, prepared.network)
 
 
 def response_to(job: Job, chosen: Sequence[Method]) -> SimulationResponse:

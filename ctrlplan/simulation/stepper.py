@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_finite, real_array
+from ctrlplan._checks import checked_finite, checked_params, real_array
 from ctrlplan._display import Displayed, Facts, Part, counted, number
 from ctrlplan._types import Array
 from ctrlplan.simulation.held_steps import Grid, Steps, steps_of
@@ -208,7 +208,7 @@ def started(
     tolerance = checked_finite(rtol, "rtol", above=0.0)
     if first + 1e-3 * step == first or step > _LONGEST:
         raise ValueError(f"dt must be resolved by times about {first:g} s and at most {_LONGEST:g} s, got {step:g} s")
-    state, given = checked_state(prepared, initial_state), dict(params or {})
+    state, given = checked_state(prepared, initial_state), checked_params(params)
     check_begin(prepared.starts, first, initial_state is None)
     warn_of_unread(prepared, given)
     warn_of_timebase(prepared)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import ctrlplan
-from ctrlplan._checks import real_array
+from ctrlplan._checks import checked_params, real_array
 from ctrlplan._display import Displayed, Facts, Part, counted, time_text, title_of
 from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event
@@ -188,7 +188,7 @@ class Experiment(Displayed):
             "outputs": _once(outputs),
             "controls": _once(controls),
             "initial_state": initial_state,
-            "params": params,
+            "params": None if params is None else checked_params(params),
             "events": _once(events),
             "measures": checked_measures(measures),
         }
@@ -288,7 +288,7 @@ class Experiment(Displayed):
     def simulated(self, loop: System | Builder, name: str, params: Params | None = None) -> Run:
         """Simulate a loop with one of the plans; arguments as for `run_plan`."""
         plan = self.plans[name]
-        merged = self.params if params is None else {**(self.params or {}), **params}
+        merged = self.params if params is None else {**(self.params or {}), **checked_params(params)}
         return run_plan(
             loop,
             name,

@@ -195,3 +195,29 @@ def test_a_matrix_that_was_set_to_complex_numbers():
     system.A = np.array([[-1.0 + 2.0j]])
     with pytest.raises(TypeError, match="A of turned must be real numbers, got complex numbers"):
         cp.simulate(system, T, 1.0)
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda params: cp.simulate(LOOP, T, PLAN, params=params),
+        lambda params: cp.simulate(BENT, T, PLAN, params=params),
+        lambda params: cp.prepare(BENT).start(0.1, params=params),
+        lambda params: cp.Experiment({"r": PLAN}, T, params=params),
+        lambda params: cp.Experiment({"r": PLAN}, T).run_plan(BENT, "r", params),
+        lambda params: cp.compare(LOOP, {"r": PLAN}, T, params=params),
+        lambda params: cp.sweep(lambda gain: LOOP, [1.0], {"r": PLAN}, T, params=params, progress=False),
+        lambda params: cp.monte_carlo(BENT, {"k": [1.0]}, {"r": PLAN}, T, params=params, progress=False),
+        lambda params: cp.flat_system(BENT, ["y[0]"], params=params),
+        lambda params: cp.flat_candidates(BENT, params=params),
+    ],
+)
+@pytest.mark.parametrize("wrong", [[1], "k", 3, [], [("k", 1.0)], {1: 2.0}])
+def test_params_that_are_no_mapping_of_names(run, wrong):
+    what = (
+        "params must have names as keys, such as 'mass', got 1"
+        if isinstance(wrong, dict)
+        else f"params must be a mapping of names to values, such as .'mass': 2.0., got {type(wrong).__name__}"
+    )
+    with pytest.raises(TypeError, match=what):
+        run(wrong)
