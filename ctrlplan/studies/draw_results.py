@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import TypeAlias
 
 import numpy as np
@@ -100,14 +100,17 @@ class DrawResults:
         """Failures in the order of the draws."""
         return tuple(sorted(self._failures, key=lambda failure: failure.draw))
 
-    def metrics(self, plans: Iterable[str]) -> dict[str, dict[str, Array]]:
-        """Metrics by plan, in the order in which the draws have them."""
+    def metrics(self, expected: Mapping[str, Iterable[str]]) -> dict[str, dict[str, Array]]:
+        """Metrics by plan, in the order in which the draws have them; nan and as expected where no draw has any."""
         found = {}
-        for plan in plans:
+        for plan, without in expected.items():
             listed = sorted(self._names.get(plan, {}).items(), key=lambda one: one[1])
             names = dict.fromkeys(name for names, _ in listed for name in names)
-            if plan in self._metrics:
-                found[plan] = {name: self._metrics[plan][name] for name in names}
+            known = self._metrics.get(plan)
+            if known is not None:
+                found[plan] = {name: known[name] for name in names}
+            elif without:
+                found[plan] = {name: np.full(self._count, np.nan) for name in without}
         return found
 
     def bands(self, plans: Iterable[str]) -> dict[str, dict[str, Array]]:

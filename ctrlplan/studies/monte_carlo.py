@@ -168,7 +168,7 @@ def monte_carlo(
     return Ensemble(
         nominal,
         table,
-        results.metrics(experiment.plans),
+        results.metrics({plan: nominal.metrics.get(plan, {}) for plan in experiment.plans}),
         results.timepts,
         results.bands(experiment.plans),
         failures=results.failures(),

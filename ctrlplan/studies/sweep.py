@@ -225,8 +225,9 @@ class Sweep(Displayed):
         """
         from ctrlplan.reports import write_page
 
-        if not self.metrics:
-            raise ValueError("a report must have metrics, got a sweep in which every value failed; see .failures")
+        if len(self.failures) == self.values.size:
+            why = "in which every value failed; see .failures" if self.failures else "interrupted before any value"
+            raise ValueError(f"a report must have metrics, got a sweep {why}")
         return write_page([self], path, title or f"Sweep over {self.parameter}")
 
     def plot(
@@ -402,7 +403,7 @@ def sweep(
 
     done = executed(runs, points.tolist(), outcomes.__setitem__, execution, parameter, identity)
     done.raise_if_none_ran("build")
-    found = _swept(parameter, points, outcomes, done)
+    found = _swept(parameter, points, outcomes, done, experiment)
     found = _described(found, experiment, dict(units or {}))
     if found.interrupted:
         text = f"the sweep was interrupted: {found.values.size} of {points.size} values are returned"
@@ -417,7 +418,9 @@ def _checked_values(values: ArrayLike) -> Array:
     return points
 
 
-def _swept(parameter: str, points: Array, outcomes: Mapping[int, Metrics | Failed], done: Executed) -> Sweep:
+def _swept(
+    parameter: str, points: Array, outcomes: Mapping[int, Metrics | Failed], done: Executed, experiment: Experiment
+) -> Sweep:
     found = dict(sorted(outcomes.items()))
     errors = [(i, outcome) for i, outcome in enumerate(found.values()) if isinstance(outcome, Failed)]
     if errors and len(errors) == len(found) and not done.interrupted:
@@ -429,6 +432,9 @@ def _swept(parameter: str, points: Array, outcomes: Mapping[int, Metrics | Faile
             row = rows.setdefault(plan, {})
             for name, value in values.items():
                 row.setdefault(name, np.full(reached.size, np.nan))[i] = value
+    if not rows:  # interrupted before a value was finished
+        names = wanted_measures(experiment.measures)
+        rows = {plan: {name: np.full(reached.size, np.nan) for name in names} for plan in experiment.plans}
     failures = tuple(Failure(i, {parameter: float(reached[i])}, failed.message) for i, failed in errors)
     again, missing = (tuple(points[list(numbers)].tolist()) for numbers in (done.sent_again, done.missing))
     return Sweep(parameter, reached, rows, failures, done.interrupted, sent_again=again, missing=missing)

@@ -287,6 +287,29 @@ def test_an_interruption_before_anything_was_found_leaves_the_nominal_run(tmp_pa
     assert result.report(tmp_path).exists()
 
 
+@pytest.mark.parametrize("measures", [None, ["iae"]])
+@pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
+def test_metrics_without_a_finished_draw_are_nan(measures):
+    calls = []
+
+    def build(tau=1.0):
+        calls.append(tau)
+        if len(calls) > 1:  # the nominal loop is first
+            raise KeyboardInterrupt
+        return cp.plants.integrator_lag_loop(tau)
+
+    found = cp.monte_carlo(build, {"tau": [1.0, 2.0, 3.0]}, PLANS, TIMES, progress=False, measures=measures)
+    assert found.interrupted
+    assert found.finished == 0
+    assert list(found.metrics) == list(PLANS)
+    for plan, rows in found.metrics.items():
+        assert list(rows) == list(found.nominal.metrics[plan])
+        assert "iae" in rows
+        assert all(row.shape == (3,) and np.isnan(row).all() for row in rows.values())
+    assert np.isnan(found.quantiles("iae")["step"]).all()
+    assert np.isnan(found.best("iae")["step"])
+
+
 @pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
 def test_answers_need_not_be_cancelled():
     class Ends(Elsewhere):

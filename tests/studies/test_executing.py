@@ -506,6 +506,12 @@ def test_an_interruption_returns_every_value_that_was_finished(build, k):
     if k:
         check(found, RATES[:k])
     assert found.results([]) == {"value": RATES[:k]} | {plan: {} for plan in found.metrics}
+    assert list(found.metrics) == list(PLANS)
+    assert all(row.size == k for plan in PLANS for row in found.metrics[plan].values())
+    assert "settling_time" in found.metrics["step"]
+    if not k:
+        with pytest.raises(ValueError, match="got a sweep interrupted before any value"):
+            found.report("page.html")
 
 
 @pytest.mark.parametrize("build", [lag, bent])
