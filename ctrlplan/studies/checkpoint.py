@@ -7,7 +7,9 @@ import io
 import json
 import math
 import os
+import tempfile
 import time
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,7 +21,9 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ctrlplan._display import counted
 from ctrlplan._files import write_bytes, write_text
+from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array
 from ctrlplan.studies.outcomes import Failed
 
@@ -64,19 +68,26 @@ class Checkpoint:
         path = Path(folder)
         if path.exists() and not path.is_dir():
             raise FileExistsError(f"checkpoint must be a folder, got {path}, which is a file; give another path")
-        path.mkdir(parents=True, exist_ok=True)
         known = path / _STUDY
-        if known.exists():
-            found = _json(known, known.read_text(encoding="utf-8"))
+        with _used(path):
+            path.mkdir(parents=True, exist_ok=True)
+            text = known.read_text(encoding="utf-8") if known.exists() else None
+            if text is None:
+                write_text(known, json.dumps(study, indent=1))
+        if text is not None:
+            found = _json(known, text)
             differ = [name for name in dict.fromkeys((*study, *found)) if not _same(study.get(name), found.get(name))]
             if differ:
                 raise ValueError(
                     f"checkpoint must be a folder of the same study, got {path}, which has another in "
                     f"{', '.join(differ)}; give a new folder, or delete this one"
                 )
-        else:
-            write_text(known, json.dumps(study, indent=1))
         return cls(path)
+
+    def check_writable(self) -> None:
+        """Raise an OSError if no file can be made in the folder."""
+        with _used(self.folder), tempfile.TemporaryFile(dir=self.folder):
+            pass
 
     def read(self) -> Iterator[tuple[int, Any]]:
         """Number and outcome of each value that is stored.
@@ -98,34 +109,86 @@ class Checkpoint:
                     seen.add(number)
                     yield number, _restored(outcome, data)
 
-    @contextmanager
-    def keeping(self, size: int) -> Iterator[Keep]:
+    def keeping(self, size: int) -> Keeping:
         """Context with a function that stores outcomes, in files of a number of values or of ten seconds."""
-        kept: dict[int, Any] = {}
-        since = time.monotonic()
+        return Keeping(self, size)
 
-        def keep(number: int, outcome: Any) -> None:
-            nonlocal since
-            if _has_failed(outcome):
-                return
-            kept[number] = outcome
-            if len(kept) >= size or time.monotonic() - since > _SECONDS:
-                self._write(kept)
-                kept.clear()
-                since = time.monotonic()
-
-        try:
-            yield keep
-        finally:
-            if kept:
-                self._write(kept)
-
-    def _write(self, outcomes: Mapping[int, Any]) -> None:
+    def write(self, outcomes: Mapping[int, Any]) -> None:
+        """Write outcomes by number to a new file."""
         arrays = _Arrays()
         stored = [(number, _plain(outcome, arrays)) for number, outcome in outcomes.items()]
         file = io.BytesIO()
         np.savez(file, outcomes=np.array(json.dumps(stored)), data=np.concatenate([np.empty(0), *arrays.pieces]))
         write_bytes(self.folder / f"outcomes-{min(outcomes):08d}-{uuid4().hex}.npz", file.getvalue())
+
+
+class Keeping:
+    """Context whose value is a function that stores outcomes.
+
+    Outcomes that cannot be written, as on a full disk, remain in memory, with a
+    warning, and are written later if that becomes possible.
+
+    Parameters
+    ----------
+    checkpoint : Checkpoint
+        Where they are stored.
+    size : int
+        Number of values of a file, unless ten seconds have passed.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, size: int) -> None:
+        self._checkpoint, self._size = checkpoint, size
+        self._kept: dict[int, Any] = {}
+        self._since = time.monotonic()
+        self._refused = False
+
+    def __enter__(self) -> Keep:
+        return self._keep
+
+    def __exit__(self, *_: object) -> None:
+        if self._kept and (error := self._write()) is not None:
+            self._warn(error, "are not stored; they are run again by a second call")
+
+    def _keep(self, number: int, outcome: Any) -> None:
+        if _has_failed(outcome):
+            return
+        self._kept[number] = outcome
+        late = time.monotonic() - self._since > _SECONDS
+        if late or (len(self._kept) >= self._size and not self._refused):
+            known, error = self._refused, self._write()
+            if error is not None and not known:
+                self._warn(error, "so far are kept in memory; the runs go on, and writing is tried again")
+
+    def _write(self) -> OSError | None:
+        """Write what has not been written; return the error if that fails."""
+        self._since = time.monotonic()
+        try:
+            self._checkpoint.write(self._kept)
+        except OSError as error:
+            self._refused = True
+            return error
+        self._kept.clear()
+        self._refused = False
+        return None
+
+    def _warn(self, error: OSError, rest: str) -> None:
+        values, why = counted(len(self._kept), "finished value"), error.strerror or error
+        text = f"checkpoint {self._checkpoint.folder} cannot be written ({why}): {values} {rest}"
+        warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())
+
+
+@contextmanager
+def _used(folder: Path) -> Iterator[None]:
+    """Context in which an error of the file system names the argument and what to do."""
+    try:
+        yield
+    except OSError as error:
+        why = error.strerror or str(error)
+        clear = type(error)(
+            f"checkpoint must be a folder that can be made, read and written to, got {folder}: {why}; give another path"
+        )
+        clear.errno = error.errno
+        raise clear from error
 
 
 def digest(values: ArrayLike) -> str:

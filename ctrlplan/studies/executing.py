@@ -159,12 +159,21 @@ def executed(
     ------
     ValueError
         If the checkpoint is that of another study.
+    OSError
+        If its folder cannot be made, read or written to.
+
+    Warns
+    -----
+    UserWarning
+        If outcomes cannot be written to it later.
     """
     store = None if execution.checkpoint is None else Checkpoint.opened(execution.checkpoint, identity())
     account = _Account(collect)
     for number, outcome in store.read() if store else ():
         account.add(number, outcome)
     numbers = [number for number in range(len(values)) if number not in account.seen]
+    if store and numbers:
+        store.check_writable()
     size, dispatch, executor = execution.chunk or LARGEST, None, execution.executor
     if executor is None or not numbers:
         outcomes = runs.outcomes([values[number] for number in numbers], execution.timeout)

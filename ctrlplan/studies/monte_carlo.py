@@ -122,11 +122,14 @@ def monte_carlo(
         cannot be sent to other processes, or the checkpoint is that of another
         study. An exception of the nominal loop is raised if an argument causes
         it, or if no draw runs.
+    OSError
+        If the folder of the checkpoint cannot be made, read or written to.
 
     Warns
     -----
     UserWarning
-        If Ctrl-C ended the runs.
+        If Ctrl-C ended the runs; or if finished draws cannot be written to the
+        checkpoint, see `sweep`.
 
     Examples
     --------

@@ -340,11 +340,15 @@ def sweep(
         fail, the first exception is raised, SystemExit as a RuntimeError.
     RuntimeError
         If a worker has other versions of ctrlplan or casadi.
+    OSError
+        If the folder of the checkpoint cannot be made, read or written to.
 
     Warns
     -----
     UserWarning
-        If Ctrl-C ended the sweep.
+        If Ctrl-C ended the sweep; or if finished values cannot be written to the
+        checkpoint, as on a full disk. They are kept in memory and in the result,
+        and written later if that becomes possible.
 
     See Also
     --------

@@ -172,3 +172,89 @@ def test_a_file_is_no_folder(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError, match=r"checkpoint must be a folder, got .*file, which is a file; give"):
         swept(lag, tmp_path / "file")
+
+
+@pytest.mark.parametrize("run", [swept, drawn])
+@pytest.mark.parametrize("place", ["file/new", "loop/new"])
+def test_a_folder_that_cannot_be_made(run, place, tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    built = Counted(lag)
+    with pytest.raises(OSError, match=r"checkpoint must be a folder that can be made, .*new: .*; give another path"):
+        run((lambda rate=0.5: built(rate)) if run is drawn else built, tmp_path / place)
+    assert len(built.built) <= (run is drawn)  # the nominal loop
+
+
+def test_a_folder_that_cannot_be_written_to_is_enough_for_stored_values(tmp_path, monkeypatch):
+    found = swept(lag, tmp_path, RATES[:3])
+    study = (tmp_path / "study.json").read_bytes()
+
+    def refused(**options):
+        raise PermissionError(13, "Permission denied", str(options["dir"]))
+
+    monkeypatch.setattr("ctrlplan.studies.checkpoint.tempfile.TemporaryFile", refused)
+    same(found, swept(lag, tmp_path, RATES[:3]))
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "study.json").write_bytes(study)
+    built = Counted(lag)
+    with pytest.raises(PermissionError, match=r"checkpoint must be a folder .*other: Permission denied; give another"):
+        swept(built, other, RATES[:3])
+    assert built.built == []
+
+
+class Disk:
+    """Disk that is full for some of the files that are written to it."""
+
+    def __init__(self, monkeypatch, full):
+        from ctrlplan.studies import checkpoint
+
+        self.write, self.full, self.files = checkpoint.write_bytes, full, 0
+        monkeypatch.setattr(checkpoint, "write_bytes", self)
+
+    def __call__(self, path, data):
+        self.files += 1
+        if self.files in self.full:
+            raise OSError(28, "No space left on device", str(path))
+        self.write(path, data)
+
+
+@pytest.mark.parametrize("executor", [None, InTurn])
+def test_a_disk_that_is_full_until_the_end_loses_no_result(executor, tmp_path, monkeypatch):
+    Disk(monkeypatch, range(2, 100))
+    expected = swept(bent)
+    with pytest.warns(UserWarning, match="No space left") as said:
+        found = swept(bent, tmp_path, chunk=2, executor=executor and executor())
+    same(expected, found)
+    assert [str(one.message) for one in said] == [
+        f"checkpoint {tmp_path} cannot be written (No space left on device): {text}"
+        for text in (
+            "2 finished values so far are kept in memory; the runs go on, and writing is tried again",
+            "5 finished values are not stored; they are run again by a second call",
+        )
+    ]
+    assert all(one.filename == __file__ for one in said)
+    monkeypatch.undo()
+    again = Counted(bent)
+    same(expected, swept(again, tmp_path))
+    assert again.built == RATES[2:]
+
+
+def test_a_disk_that_is_full_for_a_time_keeps_every_value(tmp_path, monkeypatch):
+    Disk(monkeypatch, [1])
+    with pytest.warns(UserWarning, match=r"cannot be written \(No space left on device\): 2 finished") as said:
+        found = swept(bent, tmp_path, chunk=2)
+    assert len(said) == 1
+    again = Counted(bent)
+    same(found, swept(again, tmp_path))
+    assert again.built == []
+
+
+def test_an_interruption_on_a_full_disk_returns_what_is_finished(tmp_path, monkeypatch):
+    Disk(monkeypatch, range(1, 100))
+    with (
+        pytest.warns(UserWarning, match="the sweep was interrupted: 3 of 7"),
+        pytest.warns(UserWarning, match="No space left on device.: 3 finished values are not stored"),
+    ):
+        found = swept(Counted(bent, at=2.0), tmp_path)
+    assert found.values.tolist() == RATES[:3]
