@@ -243,7 +243,8 @@ class Comparison(Displayed):
         its name is that of its plan followed by "(measured)". Its samples are used
         from the start to the end of the simulation, with linear interpolation at the
         times of the simulation. Metrics of signals that the log does not contain
-        are omitted, and measured runs are not ranked.
+        are omitted; settling times, overshoot and lag are nan if it ends before the
+        move. Measured runs are not ranked.
 
         Parameters
         ----------

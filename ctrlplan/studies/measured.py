@@ -36,6 +36,12 @@ _SUFFIXES = ("_ref", "_cmd", "_set", "_d", "_des")
 _UNLIKE = 0.2
 """Difference of a command from the plan, relative to its range, from which it is not that of the plan."""
 
+_OF_MOVE = ("settling_time", "tracking_settling_time", "overshoot_error", "overshoot_final", "lag_error")
+"""Metrics that are not known without the whole move; others are over the time of the log."""
+
+_STEP = 1.001
+"""Time from the end of a log to that of the move, in steps of the log, up to which the log has the whole move."""
+
 AlignedBy = Literal["command", "output", "control", "given"]
 """By what the time of a log was aligned."""
 
@@ -72,6 +78,9 @@ class MeasuredRun:
         Outputs and controls of the comparison that the log does not contain.
     failures : dict of str to str
         Reasons of measures of runs that could not be evaluated.
+    lacking : float
+        Time [s] from the end of the log to the end of the move, 0 if the log has
+        all of it. Metrics of the whole move are otherwise nan.
     """
 
     plan: str
@@ -85,6 +94,7 @@ class MeasuredRun:
     resampling: str
     left_out: tuple[str, ...] = ()
     failures: dict[str, str] = field(default_factory=dict)
+    lacking: float = 0.0
 
     @property
     def aligned(self) -> SimulationResponse:
@@ -97,6 +107,8 @@ class MeasuredRun:
     def sentences(self) -> Iterator[str]:
         """What a reader of the metrics must know."""
         yield self.resampling
+        if self.lacking:
+            yield f"the log ends {self.lacking:.4g} s before the move: settling times, overshoot and lag are not known"
         if self.by == "given":
             yield f"its time is {abs(self.offset):.6g} s {self._order} than that of the plan, as given"
         else:
@@ -175,7 +187,8 @@ class _Alongside:
         where += f"; {offset.others} other offsets fit as well" if offset.others else ""
         rows = [np.interp(t, self.t - offset.seconds, row) for row in self.signals.values()]
         response = measured_response(t, np.array(rows), list(self.signals), where, f"Measured with {self.plan}")
-        metrics, failures = self._metrics(response)
+        lacking = self._lacking(offset.seconds)
+        metrics, failures = self._metrics(response, lacking)
         run = MeasuredRun(
             self.plan,
             self.log,
@@ -188,6 +201,7 @@ class _Alongside:
             where,
             self.left_out,
             failures,
+            lacking,
         )
         old, name = self.comparison, self._name()
         limits = {k: pair for k, pair in old.limits.get(self.plan, {}).items() if k in self.signals}
@@ -325,7 +339,12 @@ class _Alongside:
             where += f"; metrics cover this time only, of {time_text(given[0])} to {time_text(given[-1])} s"
         return np.union1d(common, own[apart > 1e-6 * step]), where
 
-    def _metrics(self, response: SimulationResponse) -> tuple[dict[str, float], dict[str, str]]:
+    def _lacking(self, offset: float) -> float:
+        """Time [s] from the last sample of the log to the end of the move, 0 up to a step of the log."""
+        rest = move_end(self.reference, self.comparison.waypoints) - (float(self.t[-1]) - offset)
+        return rest if float(np.median(np.diff(self.t))) * _STEP < rest < math.inf else 0.0
+
+    def _metrics(self, response: SimulationResponse, lacking: float) -> tuple[dict[str, float], dict[str, str]]:
         """Metrics whose signals the log contains, and reasons of those that could not be evaluated."""
         old = self.comparison
         held = {name: name in self.signals for name in (*old.outputs, *old.controls)}
@@ -353,4 +372,7 @@ class _Alongside:
         for name in set(MEASURES) - set(old.measures):
             if name in found:  # over signals in different units
                 found[name] = math.nan
+        if lacking:
+            unknown = (key for name in _OF_MOVE for key in (name, *(f"{name}_{label}" for label in axes)))
+            found |= {key: math.nan for key in unknown if key in found}
         return found, failures

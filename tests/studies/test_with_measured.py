@@ -212,6 +212,44 @@ def test_a_log_that_ends_early_says_what_it_covers(base):
     assert found.responses["quintic (measured)"].time[-1] == pytest.approx(1.499, abs=1e-9)
 
 
+OF_MOVE = ("settling_time", "tracking_settling_time", "overshoot_error", "overshoot_final", "lag_error")
+
+
+@pytest.mark.parametrize("count", [700, 1200, 1499, 1500, 1501, 2000])
+def test_metrics_of_the_move_are_nan_for_a_log_that_ends_before_it(count, base):
+    """The move ends at 1 s, sample 1500 of the log."""
+    log = machine()
+    early = cp.read_log({"time": log.time[:count], "y": log.outputs[0][:count], "u": log.outputs[1][:count]})
+    found = base.with_measured({"quintic": early}, align=OFFSET)
+    name = "quintic (measured)"
+    t, (y, u) = found.responses[name].time, found.responses[name].outputs
+    said = f"the log ends {1.501 - 1e-3 * count:.4g} s before the move: settling times, overshoot and lag are not known"
+    if count < 1500:
+        assert all(np.isnan(found.metrics[name][key]) for key in OF_MOVE)
+        assert said in found.marks[name]
+        assert found.measured[name].lacking == pytest.approx(1.501 - 1e-3 * count, abs=1e-9)
+    else:
+        assert not any(np.isnan(found.metrics[name][key]) for key in OF_MOVE)
+        assert "before the move" not in found.marks[name]
+        assert found.measured[name].lacking == 0.0
+    # Integrals and peaks are over the time of the log, as the mark says.
+    assert found.metrics[name]["iae"] == pytest.approx(float(cp.metrics.iae(t, PLAN(t).ravel() - y)), rel=1e-12)
+    assert found.metrics[name]["control_peak"] == pytest.approx(float(cp.metrics.peak(t, u)), rel=1e-12)
+    assert f"{name}: " in headline(found)
+    assert "nan" not in headline(found) + str(found)
+
+
+def test_each_axis_of_a_log_that_ends_before_the_move():
+    points = [cp.Waypoint(0, [0, 0], [0, 0]), cp.Waypoint(1, [1, 2], [0, 0])]
+    two = ct.ss(-9 * np.eye(2), 9 * np.eye(2), np.eye(2), 0, inputs=["a", "b"], outputs=["a", "b"])
+    base = cp.compare(two, {"cubic": cp.PolySpline(points, labels=["a", "b"])}, TIMES)
+    run = base.responses["cubic"]
+    log = cp.read_log({"time": run.time[:300], "a": run.outputs[0][:300], "b": run.outputs[1][:300]})
+    metrics = base.with_measured({"cubic": log}, align=None).metrics["cubic (measured)"]
+    assert all(np.isnan(metrics[f"{key}{axis}"]) for key in OF_MOVE for axis in ("", "_a", "_b"))
+    assert metrics.keys() == base.metrics["cubic"].keys()
+
+
 # What is shown
 
 
