@@ -130,8 +130,12 @@ class Series:
     @cached_property
     def flat(self) -> Array:
         """These, column by column, and the bounds; nan for a signal whose coefficients are not finite."""
-        undefined = np.where(np.isfinite(self.terms).all(axis=1), 0.0, np.nan)
-        return np.concatenate([self.terms.ravel(order="F"), self.low + undefined, self.high + undefined])
+        terms, low, high = self.terms, self.low, self.high
+        defined = np.isfinite(terms)
+        if not defined.all():
+            undefined = np.where(defined.all(axis=1), 0.0, np.nan)
+            low, high = low + undefined, high + undefined
+        return np.concatenate([terms.ravel(order="F"), low, high])
 
     def with_harmonics(self, known: tuple[float, int] | None, accuracy: float, rounding: Array | float) -> Series:
         """Same signals with their trigonometric sum of known rate and number of harmonics, if it has fewer terms."""
@@ -254,8 +258,10 @@ class SampledSignal:
 
     def ends(self, left: float, right: float) -> tuple[Array, Array] | None:
         """Values at both ends of the line that contains the middle of a segment."""
-        first, last = self.analytic_at(0.5 * (left + right), left, np.array([0.0, right - left])).T
-        return first, last
+        line = self._line(0.5 * (left + right))
+        (t0, t1), (v0, v1) = self.times[line].tolist(), self.values[line].tolist()
+        first, last = (v0 + (v1 - v0) * ((left - t0 + s) / (t1 - t0)) for s in (0.0, right - left))
+        return np.array([first]), np.array([last])
 
     def at(self, times: Array) -> Array:
         """Interpolated values."""
@@ -477,8 +483,9 @@ def _rounding_of_lines(times: Array, size: Array | float, steepness: Array | flo
 
 def straight(left: float, right: float, first: Array, last: Array) -> Series:
     """Series of straight lines with values (nsignals,) at both ends, which are their bounds."""
-    constant = np.array_equal(first, last)
-    coefficients = first[:, None] if constant else np.column_stack([0.5 * (first + last), 0.5 * (last - first)])
+    coefficients = first[:, None]
+    if (first != last).any():
+        coefficients = np.array([0.5 * (first + last), 0.5 * (last - first)]).T
     return Series(left, right, coefficients, np.minimum(first, last), np.maximum(first, last))
 
 
