@@ -274,6 +274,19 @@ def test_samples_of_many_inputs(even, n, m):
     assert np.array_equal(cp.simulate(system, t, list(u), initial).states, found)
 
 
+def test_many_inputs_with_the_same_breakpoints_are_solved_by_segments(monkeypatch):
+    from ctrlplan.simulation.methods import exact as method
+
+    monkeypatch.setattr(method, "moment_states", None)  # for many different breakpoints only
+    t, values = np.linspace(0.0, 4.0, 101), np.linspace(-1.0, 2.0, 60)
+    system = ct.ss(-1.0, np.ones((1, 60)), 1.0, np.zeros((1, 60)))
+    found = cp.simulate(system, t, values).outputs
+    assert np.abs(found - values.sum() * (1.0 - np.exp(-t))).max() <= 1e-13 * np.abs(values).sum()
+    steps = [cp.Step(value, time=1.0) for value in values]
+    found = cp.simulate(system, t, steps).outputs
+    assert np.abs(found - values.sum() * (1.0 - np.exp(np.minimum(1.0 - t, 0.0)))).max() <= 1e-13 * np.abs(values).sum()
+
+
 def test_samples_without_states_or_inputs():
     t = np.linspace(0.0, 2.0, 9)
     assert sampled_states(np.zeros((0, 0)), np.zeros((0, 1)), np.ones((1, 9)), t, np.zeros(0)).shape == (0, 9)

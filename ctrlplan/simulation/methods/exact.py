@@ -144,7 +144,7 @@ def _run(job: Job, form: LinearForm) -> Record:
     kinds, widths = [isinstance(signal, SampledSignal) for signal in time_signals], [s.width for s in time_signals]
     sampled = np.repeat(np.array(kinds, dtype=bool), widths)
     first, last = float(job.times[0]), float(job.times[-1])
-    breakpoints = [t for plan, _ in plans for t in plan.breakpoints_between(first, last)]
+    breakpoints = sorted({t for plan, _ in plans for t in plan.breakpoints_between(first, last).tolist() if t > first})
     watched = job.watched()
     times = with_event_times(job.times, watched, lambda: form.a)
 
@@ -159,8 +159,8 @@ def _run(job: Job, form: LinearForm) -> Record:
             return _finite(sampled_states(a, form.b, signal_values(time_signals, t), t, state))
         found = None
         if len(a) > _MANY_STATES or (len(a) and len(breakpoints) > _MANY_SEGMENTS):
-            marks = np.unique(breakpoints)
-            found = moment_states(a, form.b[:, ~sampled], partial(signal_values, planned), marks, t, state)
+            values = partial(signal_values, planned)
+            found = moment_states(a, form.b[:, ~sampled], values, np.array(breakpoints), t, state)
         if found is None:
             found = exact_states(a, form.b[:, ~sampled], jet, breakpoints, t, state)
         if sampled.any():  # superposition of the responses to plans and to samples
