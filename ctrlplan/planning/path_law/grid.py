@@ -17,6 +17,9 @@ from ctrlplan.trajectories.common import Array, readonly
 _SHORT, _GROWTH = 1e-5, 0.35
 """Duration of the cell at a point of rest relative to its span, and the increase of lengths per length."""
 
+_REGULAR, _SHORT_SMOOTH = 0.03, 3e-3
+"""The same with limits of the jerk, where the squared rate is regular at a point of rest, and elsewhere."""
+
 _BEND = 0.25
 """Length of a cell relative to the time in which the plan's speed changes by its acceleration."""
 
@@ -52,11 +55,11 @@ class Grid:
     length: Array
 
     @classmethod
-    def of(cls, plan: Trajectory, parts: Sequence[Part]) -> Grid:
-        """Initial cells, short at points of rest."""
+    def of(cls, plan: Trajectory, parts: Sequence[Part], smooth: bool = False) -> Grid:
+        """Initial cells, short at points of rest, for laws whose acceleration or, if `smooth`, jerk is limited."""
         spans = [(k, span) for k, part in enumerate(parts) for span in part.spans]
         count = max(_PER_SPAN, -(-_CELLS // len(spans)))
-        shortest = np.concatenate([_shortest(part, count) for part in parts]).tolist()
+        shortest = np.concatenate([_shortest(part, count, smooth) for part in parts]).tolist()
         edges = [
             span.start + span.length * _fractions(count, *pair) for (_, span), pair in zip(spans, shortest, strict=True)
         ]
@@ -124,12 +127,16 @@ class Grid:
         return self.plan.breakpoints[self.segment] + self.start + self.length * fractions[:, None]
 
 
-def _shortest(part: Part, count: int) -> Array:
+def _shortest(part: Part, count: int, smooth: bool) -> Array:
     """Lengths (nspans, 2) of the first and last cell of each span, relative to the span."""
     lengths = np.array([span.length for span in part.spans])
     powers = np.array([span.rests for span in part.spans])
-    # With constant acceleration from rest the distance is the time to the power 2/(power + 1).
-    found = np.where(powers > 0.0, _SHORT ** (2.0 / (np.maximum(powers, 2.0) + 1.0)), 1.0 / count)
+    # With constant acceleration or jerk from rest, plan times are times to the power 2/(power + 1) or 3/(power + 1).
+    if smooth:
+        found = np.where(np.rint(powers) == 2.0, _REGULAR, _SHORT_SMOOTH ** (3.0 / (np.maximum(powers, 2.0) + 1.0)))
+    else:
+        found = _SHORT ** (2.0 / (np.maximum(powers, 2.0) + 1.0))
+    found = np.where(powers > 0.0, np.minimum(found, 1.0 / count), 1.0 / count)
     with np.errstate(divide="ignore", over="ignore"):
         bends = _BEND / np.abs(part.bends)
         found[:, 1] = np.minimum(found[:, 1], bends / lengths)

@@ -74,7 +74,7 @@ def fastest_smooth_law(
     """
     edges = [time - start + plan.start for times in (*map(changes, bounds), narrow) for time in times]
     parts = parts_of(plan, True, edges, given, start)
-    grid = Grid.of(plan, [part for part in parts if part.moves])
+    grid = Grid.of(plan, [part for part in parts if part.moves], smooth=True)
     problems = _Problems(grid, Activity.of(grid, bounds, SMOOTH_POINTS, start), reserve)
     x, duration = problems.start(), np.inf
     for refinement in range(_REFINEMENTS + 1):

@@ -23,6 +23,9 @@ SMOOTH_POINTS = readonly(0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 6)))
 _RELAXED = 0.05
 """Distance of limits from 0 with which a first law is found where they forbid a sign, relative to half their range."""
 
+_PARALLEL = 1e-9
+"""Difference of rows of two limits in one cell, relative to their size, up to which they are multiples."""
+
 _FAR = 1e4
 """Magnitude of a missing limit, relative to that on the other side."""
 
@@ -112,8 +115,13 @@ class Activity:
             elif bound.order == 3:
                 own = np.stack([derivative[bound.axis] for derivative in (first, second, *third)])
                 jerks += [own / side for side in (high, low) if np.isfinite(side).any()]
-        tangent, curvature, centre = np.array(rows).swapaxes(0, 1) if rows else np.empty((3, 0, *times.shape))
-        return cls(speeds, tangent, curvature, centre, np.array(jerks).reshape(-1, 3, *times.shape), points)
+        accelerations = np.array(rows).reshape(-1, 3, *times.shape)
+        third_rows = np.array(jerks).reshape(-1, 3, *times.shape)
+        if all(bound.is_constant for bound in bounds):
+            if not accelerations[:, 2].any():
+                accelerations = _strictest(accelerations, two_sided=True)
+            third_rows = _strictest(third_rows, two_sided=False)
+        return cls(speeds, *accelerations.swapaxes(0, 1), third_rows, points)
 
     @property
     def _control(self) -> Array:
@@ -173,6 +181,34 @@ class Activity:
         for first, second, third in self.jerks:
             found = np.maximum(found, (third * b + 1.5 * second * slope + 0.5 * first * bend) * np.sqrt(b))
         return found
+
+
+def _strictest(rows: Array, two_sided: bool) -> Array:
+    """Rows that imply all others if the path is straight in each cell; otherwise the same rows.
+
+    On a straight line the rows of all axes are multiples of one of them.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (nrows, nfactors, npoints, ncells)
+        Signals, by their factors, of which the first is the velocity.
+    two_sided : bool
+        Whether signals have limits of both signs, otherwise upper ones only.
+    """
+    if len(rows) < 3 - two_sided:
+        return rows
+    _, _, npoints, ncells = rows.shape
+    cells = np.arange(ncells)
+    row, point = np.divmod(np.abs(rows[:, 0]).reshape(-1, ncells).argmax(axis=0), npoints)
+    largest = rows[row, :, :, cells].transpose(1, 2, 0)
+    size = largest[0, point, cells]
+    shares = rows[:, 0, point, cells] / np.where(size != 0.0, size, 1.0)
+    apart = np.abs(rows - shares[:, None, None] * largest).max(axis=(0, 2))
+    if (apart > _PARALLEL * np.abs(largest).max(axis=1)).any():
+        return rows
+    if two_sided:
+        return largest[None]
+    return np.stack([rows[own, :, :, cells].transpose(1, 2, 0) for own in (shares.argmax(axis=0), shares.argmin(axis=0))])
 
 
 def _check_direction(bound: Bound, shares: Array, times: Array) -> None:
