@@ -42,6 +42,9 @@ _FINE = 4  # with finer ones in between
 _POINTS = 4  # maximum number of via points, or one more than there are corners
 _TRIES = 8  # optimisations with the same via points and further samples
 _WIDER = 0.01  # extra clearance of a second path, relative to the path length
+_NARROW = 0.1  # part of the clearance without which paths through narrow gaps are tried,
+_SHORTER = 0.95  # if they are shorter than this multiple of the others
+_NEARLY = 0.01  # part of the clearance that may be missing in a gap of which a warning is issued
 _STEP = 1e-7  # step of finite differences, for unknowns of magnitude 1
 
 
@@ -167,7 +170,8 @@ def avoid(
     -----
     UserWarning
         If the path is more than twice as long as the shortest path around the
-        obstacles.
+        obstacles, or if a shorter one leads through a gap whose width is that
+        required up to 1 % of the clearance, but no plan is found in it.
 
     Examples
     --------
@@ -206,8 +210,10 @@ def avoid(
                 elif certificate.lower > best.minimum:  # beyond rounding; in a tie the earlier plan is retained
                     best = certificate
             if found:
+                shortest = sum(map(_length, polylines[0]))
+                found += _through_gap(task, build, shortest)
                 smoothest = min(found, key=lambda avoidance: task.roughness(avoidance.plan))
-                _check_length(smoothest.plan, sum(map(_length, polylines[0])))
+                _check_length(smoothest.plan, shortest)
                 return smoothest
     if best is task.given:
         best = task.certificate(plan)
@@ -219,6 +225,30 @@ def avoid(
         f"with the load at ({x:.4g}, {z:.4g}) at {best.time:.4g} s; the search does not find every plan: "
         f"add waypoints, increase max_points or reduce the clearance"
     )
+
+
+def _through_gap(task: _Task, build: Build, shortest: float) -> list[Avoidance]:
+    """Plan through a gap about as wide as required, if that is a shorter way; warns if none is found in it.
+
+    Polygons around obstacles block gaps that are slightly wider than required.
+    """
+    distance = task.load + task.required
+    polyline = _polylines(task, -_NARROW * distance)[0]
+    length = sum(map(_length, polyline))
+    if not length < _SHORTER * shortest:
+        return []
+    plan, certificate = _search(task, build, polyline)
+    if certificate.certified:
+        return [Avoidance(plan, certificate)]
+    nearly = sum(map(_length, _polylines(task, -_NEARLY * distance)[0])) < _SHORTER * shortest
+    if nearly or task.required - certificate.minimum < _NEARLY * distance:
+        warnings.warn(
+            f"a path of length {length:.4g} leads through a gap that is about as wide as the required clearance of "
+            f"{task.required:g}, but no plan with this clearance was found in it, so that another path is taken, of "
+            f"length {shortest:.4g}; reduce the clearance slightly, or add a waypoint in the gap",
+            stacklevel=3,
+        )
+    return []
 
 
 def _check_length(plan: Trajectory, shortest: float) -> None:

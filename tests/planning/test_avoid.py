@@ -309,6 +309,38 @@ def test_a_gap_too_narrow_is_said_with_what_it_would_allow():
     assert 0.15 < best <= 0.2  # half of the gap of 1 m less the load
 
 
+@pytest.mark.parametrize("wider", [1e-3, 5e-3, 0.02])
+def test_a_gap_slightly_wider_than_required_is_passed(wider):
+    """Between discs at (5, 2 + g) and (5, 2 - g) with the radius 2: polygons around them overlap."""
+    half = 0.5 * (1.0 + wider)
+    plan = cp.PolySpline(rest([0.0, 0.0], [10.0, 0.0], 10.0))
+    obstacles = [
+        Disc((5.0, 4.0 + half), 2.0),
+        Disc((5.0, -half), 2.0),
+        Rectangle((4.5, 5.5), (6.0 + half, 14.0)),
+        Rectangle((4.5, 5.5), (-10.0, -2.0 - half)),
+    ]
+    found = avoid(plan, obstacles, clearance=0.5)
+    check(plan, found.plan, obstacles, gap=0.5)
+    assert found.clearance.certified
+    assert abs(found.plan(5.0)[1] - 2.0) < 0.5
+    assert plan_length(found.plan) < 11.5
+
+
+@pytest.mark.parametrize("wider", [-5e-3, 0.0, 1e-4])
+def test_a_gap_in_which_no_plan_is_found_is_said(wider):
+    """In a wall; the path below it is 20.6 m long."""
+    half = 0.5 * (1.0 + wider)
+    plan = cp.PolySpline(rest([0.0, 0.0], [10.0, 0.0], 10.0))
+    wall = [Rectangle((4.5, 5.5), (2.0 + half, 12.0)), Rectangle((4.5, 5.5), (-8.0, 2.0 - half))]
+    with pytest.warns(UserWarning, match=r"a path of length 10\.8\d leads through a gap .* length 2\d\.\d+; reduce"):
+        found = avoid(plan, wall, clearance=0.5)
+    assert found.clearance.certified
+    check(plan, found.plan, wall, gap=0.5)
+    clear = [Rectangle((4.5, 5.5), (2.0 + 0.45, 12.0)), wall[1]]
+    assert plan_length(avoid(plan, clear, clearance=0.5).plan) > 20.0  # 5 % narrower: without a warning
+
+
 @pytest.mark.slow
 def test_a_rope_has_no_way_under_what_reaches_above_the_trolley():
     plan = cp.PolySpline(rest([0.0, 9.0], [20.0, 9.0]))
