@@ -22,7 +22,7 @@ from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.durations import PlansByDuration, ReplannedPlans
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
-from ctrlplan.planning.path_law import FastLaw, Rates, fastest_law, fastest_smooth_law
+from ctrlplan.planning.path_law import Rates, corner_times, fastest_law, fastest_smooth_law
 from ctrlplan.planning.path_law.positions import required_rate
 from ctrlplan.planning.path_law.signals import HIGHEST, fast_laws_of_signals, law_with_given_ends
 from ctrlplan.planning.path_law.stopping import stopping
@@ -145,7 +145,7 @@ class Fastest(Displayed):
         quantities with fixed path; otherwise empty.
     stops : tuple of float
         With hold="path": times [s] of the given plan at which its path has corners,
-        where the plan stops.
+        where the plan stops, those at which it is at rest included.
     """
 
     plan: Trajectory
@@ -448,20 +448,26 @@ def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, floa
     by_derivatives = limited.derivatives_only and limited.order <= 3 and not signed
     limited.check_constant('limits with hold="path"', over_time=by_derivatives)
     if by_derivatives and limited.order <= 2:
-        return _fastest_by_derivatives(plan, limited, span, ends)
-    own, corners = _with_smooth_stops(plan, limited, lap=ends == "free")
+        found = _fastest_by_derivatives(plan, limited, span, ends)
+        return replace(found, stops=_stops(plan, limited, ends))
+    own = _with_smooth_stops(plan, limited, lap=ends == "free")
     if by_derivatives:
         found = _fastest_by_derivatives(own, limited, span, ends)
     else:
         found = (_with_given_speeds if ends == "given" else _fastest_by_signals)(own, limited, span)
     if own is not plan:
         late = found.plan.shift(plan.start)
-        return replace(found, plan=late, margins=limited.margins(late), stops=corners)
-    return found
+        found = replace(found, plan=late, margins=limited.margins(late))
+    return replace(found, stops=_stops(plan, limited, ends))
 
 
-def _with_smooth_stops(plan: Trajectory, limited: Limited, lap: bool) -> tuple[Trajectory, tuple[float, ...]]:
-    """Plan with finite limited signals where its path requires a stop, from time 0 on, and the times of its corners.
+def _stops(plan: Trajectory, limited: Limited, ends: Ends) -> tuple[float, ...]:
+    """Times [s] at which a plan stops at corners of its path, with limits that require it."""
+    return corner_times(plan, lap=ends == "free") if limited.order > 1 else ()
+
+
+def _with_smooth_stops(plan: Trajectory, limited: Limited, lap: bool) -> Trajectory:
+    """Plan with finite limited signals where its path requires a stop, from time 0 on.
 
     The plan itself if its signals are finite.
     """
@@ -472,15 +478,15 @@ def _with_smooth_stops(plan: Trajectory, limited: Limited, lap: bool) -> tuple[T
             raise
         if not limited.is_constant:
             raise ValueError(f"{error}; a plan stops at corners with constant limits only") from None
-        own, corners = stopping(plan, limited.order, lap)
+        own = stopping(plan, limited.order, lap)
         with suppress(ValueError):
             limited.check_smooth(own)
-            return own, corners
+            return own
         raise ValueError(
             f"{error}; the path may have corners, where the plan stops, but not jumps of its derivatives in motion: "
             "give a spline on it with velocities and accelerations at its waypoints"
         ) from None
-    return plan, ()
+    return plan
 
 
 def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, float] | None) -> Fastest:
@@ -674,18 +680,15 @@ def _fastest_by_derivatives(
     _check_velocities_at_rest(plan, limited)
     on_path = limited if limited.is_constant else limited.at_positions()
     find = _with_given_ends if ends == "given" else _with_free_ends
-    found, margins, stops = find(plan, on_path, span)
+    found, margins = find(plan, on_path, span)
     searched = span or (0.0, math.inf)
     feasible = ((found.duration, found.duration if ends == "given" else searched[1]),)
-    return Fastest(found, margins, feasible, "path", on_path, searched=searched, stops=stops)
+    return Fastest(found, margins, feasible, "path", on_path, searched=searched)
 
 
-def _with_free_ends(
-    plan: Trajectory, limited: Limited, span: tuple[float, float] | None
-) -> tuple[Trajectory, Margins, tuple[float, ...]]:
-    """Fastest plan on a path with any speeds at its ends, its margins, and the times of stops at its corners."""
-    law, slower = _law_under_narrow_limits(plan, limited)
-    found = law.plan
+def _with_free_ends(plan: Trajectory, limited: Limited, span: tuple[float, float] | None) -> tuple[Trajectory, Margins]:
+    """Fastest plan on a path with any speeds at its ends, and its margins."""
+    found, slower = _law_under_narrow_limits(plan, limited)
     shortest = max(_closed_form(found, limited), found.duration * slower) * _ABOVE
     if span is not None and max(shortest, span[0]) > span[1]:
         raise ValueError(
@@ -701,13 +704,13 @@ def _with_free_ends(
             UserWarning,
             stacklevel=outside_stacklevel(),
         )
-    return fast, margins, law.stops
+    return fast, margins
 
 
 def _law_under_narrow_limits(
     plan: Trajectory, limited: Limited, given: Rates = (None, None), reserve: float = 0.0
-) -> tuple[FastLaw, float]:
-    """Fast time law and the factor by which it must be slower, with finer cells where limits over time require them."""
+) -> tuple[Retimed, float]:
+    """Plan with a fast law and the factor by which it must be slower; finer cells where limits over time need them."""
     law, narrow = _law_on_path(plan, limited, given, reserve), list[float]()
     bounds = [bound for bound in limited.bounds if _is_over_time(bound)]
     if not bounds:
@@ -725,9 +728,9 @@ def _law_under_narrow_limits(
     return law, _slowest(plan, law, bounds)[0]
 
 
-def _slowest(plan: Trajectory, law: FastLaw, bounds: Sequence[Bound]) -> tuple[float, float, Bound]:
-    """Largest factor by which a law must be slower, the time [s] of the given plan, and the limit over time."""
-    found = [(*required_rate(bound, law.plan, plan.start), bound) for bound in bounds]
+def _slowest(plan: Trajectory, fast: Retimed, bounds: Sequence[Bound]) -> tuple[float, float, Bound]:
+    """Largest factor by which a plan must be slower, the time [s] of the given plan, and the limit over time."""
+    found = [(*required_rate(bound, fast, plan.start), bound) for bound in bounds]
     return max(found, key=lambda own: own[0])
 
 
@@ -746,16 +749,13 @@ def _check_passable(plan: Trajectory, bound: Bound, time: float) -> None:
 
 def _with_given_ends(
     plan: Trajectory, limited: Limited, span: tuple[float, float] | None
-) -> tuple[Trajectory, Margins, tuple[float, ...]]:
+) -> tuple[Trajectory, Margins]:
     """The same with the speeds of the plan at its ends."""
-    stops: list[tuple[float, ...]] = []
 
     def law(reserve: float) -> Trajectory:
-        found, _ = _law_under_narrow_limits(plan, limited, (1.0, 1.0), reserve)
-        stops.append(found.stops)
-        return found.plan
+        return _law_under_narrow_limits(plan, limited, (1.0, 1.0), reserve)[0]
 
-    return *_with_reserves(plan, limited, span, law), stops[-1]
+    return _with_reserves(plan, limited, span, law)
 
 
 def _with_reserves(
@@ -806,14 +806,12 @@ def _law_on_path(
     given: Rates = (None, None),
     reserve: float = 0.0,
     narrow: Sequence[float] = (),
-) -> FastLaw:
-    """Fast time law; positions in the path have full precision relative to its start."""
+) -> Retimed:
+    """Plan with a fast time law; positions in the path have full precision relative to its start."""
     begun = plan.shift(-plan.start) if plan.start else plan
     fast_law = fastest_smooth_law if limited.order == 3 else fastest_law
     found = fast_law(begun, limited.bounds, plan.start, given, reserve, narrow)
-    if not plan.start:
-        return found
-    return FastLaw(found.plan.shift(plan.start), tuple(plan.start + time for time in found.stops))
+    return found.shift(plan.start) if plan.start else found
 
 
 def _check_signs(plan: Trajectory, limited: Limited, given: bool) -> None:

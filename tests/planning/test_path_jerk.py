@@ -338,3 +338,57 @@ def test_limits_of_the_jerk_far_above_use_cost_nothing():
     plan = random_path(5, 3, 1)
     without = fastest(plan, {"velocity": 2.0, "acceleration": 4.0}, hold="path").duration
     assert fastest(plan, limits_of(2, 4, 1e6), hold="path").duration <= 1.001 * without
+
+
+@pytest.mark.parametrize("naxes", [1, 5])
+@pytest.mark.parametrize("entries", [(), (0,), (0, 0), (0, 0, 0)])
+def test_many_stops_on_a_path_of_lines(naxes, entries):
+    """From stop to stop the axis of the longest move is at its limits; those of others are not symmetric."""
+    rng = np.random.default_rng(7)
+    places = np.cumsum(rng.normal(size=(25, naxes)) * rng.choice([-0.3, 1.0, 3.0], (25, 1)), axis=0)
+    if naxes == 1 and not entries:
+        places = np.cumsum([[1.0] * 2, [-1.0] * 2] * 6).reshape(-1, 1)  # every second one is a corner
+    plan = PiecewiseSpline([Waypoint(0.5 * k, place, *entries) for k, place in enumerate(places)], warn=False)
+    limits = {"velocity": 3.0, "acceleration": 1.0, "jerk": 5.0}
+    found = fastest(plan, limits, hold="path")
+    lengths = np.abs(np.diff(places, axis=0)).max(axis=1)
+    best = sum(rest_to_rest(length, **limits) for length in lengths.tolist())
+    if entries:
+        assert best * (1 - 1e-6) <= found.duration <= 1.01 * best
+    check_limits(found.plan, limits)
+    assert found.margins.satisfied
+
+
+def rest_to_rest(distance, velocity, acceleration, jerk):
+    """Minimum time of a symmetric S-curve."""
+
+    def rise(peak):
+        return peak / acceleration + acceleration / jerk if peak * jerk > acceleration**2 else 2 * (peak / jerk) ** 0.5
+
+    low, high = 0.0, velocity
+    if velocity * rise(velocity) <= distance:
+        return rise(velocity) + distance / velocity
+    for _ in range(200):
+        peak = 0.5 * (low + high)
+        low, high = (peak, high) if peak * rise(peak) < distance else (low, peak)
+    return 2.0 * rise(low)
+
+
+def test_the_strictest_limit_of_each_sign_counts_on_a_line():
+    """Jerks of two axes that move against each other, with limits that are not symmetric, as of one axis."""
+    points = [Waypoint(0, [0, 0], 0, 0), Waypoint(1, [1, -0.5], 0, 0), Waypoint(2, [0, 0], 0, 0)]
+    limits = {
+        "y1_d2": 1.0,
+        "y2_d2": 10.0,
+        "y1_d3": cp.Limits(-8.0, 4.0),
+        "y2_d3": cp.Limits(-3.0, 2.0),
+    }
+    found = fastest(PiecewiseSpline(points), limits, hold="path")
+    # -0.5 of the first axis is the second one: -3 <= -0.5 j <= 2 is -4 <= j <= 6.
+    single = fastest(
+        PiecewiseSpline([Waypoint(k, point.position[:1], 0, 0) for k, point in enumerate(points)]),
+        {"acceleration": 1.0, "jerk": 4.0},
+        hold="path",
+    )
+    assert found.duration == pytest.approx(single.duration, rel=2e-3)
+    assert found.margins.satisfied

@@ -208,6 +208,30 @@ def test_the_plan_stops_at_corners_of_the_path_and_says_so():
     assert {jump.time for jump in found.plan.jumps(1)} <= {found.plan.start, found.plan.end}
 
 
+@pytest.mark.parametrize("start", [0.0, 2.5, -1e4])
+@pytest.mark.parametrize("entries", [(0,), (0, 0), (0, 0, 0)])
+@pytest.mark.parametrize("limits", [{}, {"jerk": 1e3}, {"both": 1e3}])
+def test_corners_at_rest_are_stops(start, entries, limits):
+    """To the right, up after a dwell, on in the same direction, to the right, and down."""
+    places = [[0, 0], [1, 0], [1, 0], [1, 1], [1, 2], [2, 2], [2, 1]]
+    plan = PiecewiseSpline([Waypoint(start + k, place, *entries) for k, place in enumerate(places)])
+    system = (lambda jet: {"both": jet[1, 0] + jet[2, 1]}) if "both" in limits else None
+    found = fastest(plan, {"velocity": 10.0, "acceleration": 1.0} | limits, system, hold="path")
+    assert found.stops == (start + 1.0, start + 2.0, start + 4.0, start + 5.0)
+
+
+@pytest.mark.parametrize("jerk", [{}, {"jerk": 1e3}])
+def test_a_stop_on_a_smooth_path_is_no_corner(jerk):
+    """A curve with a stop inside, and lines that meet with an angle of 1e-3 rad."""
+    curve = PolySpline([Waypoint(0, [0, 0], [1, 0]), Waypoint(2, [1, 1], [0, 1])])
+    law = PiecewiseSpline([Waypoint(0, 0, 0, 0), Waypoint(1, 0.7, 0, 0), Waypoint(3, 2, 0, 0)])
+    plan = Retimed(curve, law)
+    assert fastest(plan, {"acceleration": 1.0} | jerk, hold="path").stops == ()
+    turned = cp.PolySpline([Waypoint(1, [0, 0], 0, 0), Waypoint(3, [1e-3, 1], 0, 0)])
+    straight = cp.PolySpline([Waypoint(0, [0, -1], 0, 0), Waypoint(1, [0, 0], 0, 0)])
+    assert fastest(straight.then(turned), {"acceleration": 1.0} | jerk, hold="path").stops == (1.0,)
+
+
 @pytest.mark.parametrize("start", [0.0, 2.5])
 @pytest.mark.parametrize("limits", [{}, {"jerk": 1e3}, {"both": 1e3}])
 def test_a_cyclic_polygon_stops_at_its_first_corner_too(start, limits):

@@ -12,7 +12,7 @@ linearised ones (`signals`).
 """
 
 from ctrlplan.planning.path_law.jerk import fastest_smooth_law
-from ctrlplan.planning.path_law.law import FastLaw, fastest_law
-from ctrlplan.planning.path_law.spans import Rates
+from ctrlplan.planning.path_law.law import fastest_law
+from ctrlplan.planning.path_law.spans import Rates, corner_times
 
-__all__ = ["FastLaw", "Rates", "fastest_law", "fastest_smooth_law"]
+__all__ = ["Rates", "corner_times", "fastest_law", "fastest_smooth_law"]

@@ -18,7 +18,7 @@ from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.interior_point import Problem, minimum
-from ctrlplan.planning.path_law.law import FastLaw, changes, losses, problem_of
+from ctrlplan.planning.path_law.law import changes, losses, problem_of
 from ctrlplan.planning.path_law.rows import SMOOTH_POINTS, Activity
 from ctrlplan.planning.path_law.spans import Part, Rates, parts_of
 from ctrlplan.trajectories import PiecewisePolynomial, Retimed, Trajectory
@@ -49,7 +49,7 @@ def fastest_smooth_law(
     given: Rates = (None, None),
     reserve: float = 0.0,
     narrow: Sequence[float] = (),
-) -> FastLaw:
+) -> Retimed:
     """Time law of minimum duration under limits up to the jerk.
 
     Parameters
@@ -86,7 +86,7 @@ def fastest_smooth_law(
         local, grid = on_pieces(local, counts), grid.divided(counts)
         problems = _Problems(grid, Activity.of(grid, bounds, SMOOTH_POINTS, start), reserve)
         x = problems.near(local)
-    return FastLaw(Retimed(plan, smooth_law(plan, parts, grid, local)), ())
+    return Retimed(plan, smooth_law(plan, parts, grid, local))
 
 
 class _Problems:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,22 +29,6 @@ _START = 0.9
 """Feasible start relative to the limits."""
 
 
-@dataclass(frozen=True)
-class FastLaw:
-    """Plan with a fast time law.
-
-    Attributes
-    ----------
-    plan : Retimed
-        Plan that satisfies the limits up to a small violation between points of the cells.
-    stops : tuple of float
-        Times [s] of the given plan at which the path has corners, where the law stops.
-    """
-
-    plan: Retimed
-    stops: tuple[float, ...]
-
-
 def fastest_law(
     plan: Trajectory,
     bounds: Sequence[Bound],
@@ -53,7 +36,7 @@ def fastest_law(
     given: Rates = (None, None),
     reserve: float = 0.0,
     narrow: Sequence[float] = (),
-) -> FastLaw:
+) -> Retimed:
     """Time law of minimum duration under limits of velocities and accelerations.
 
     Parameters
@@ -91,7 +74,7 @@ def fastest_law(
         if loss.sum() < _LOSS or refinement == _REFINEMENTS:
             break
         grid = grid.divided(np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int))
-    return FastLaw(Retimed(plan, _law(plan, parts, grid, local)), _corners(plan, parts))
+    return Retimed(plan, _law(plan, parts, grid, local))
 
 
 def changes(bound: Bound) -> tuple[float, ...]:
@@ -130,11 +113,3 @@ def _law(plan: Trajectory, parts: Sequence[Part], grid: Grid, local: Array) -> T
     rates = np.append(local, np.ones((3, len(own))), axis=1)
     order = np.argsort(places)
     return TimeLaw(np.append(places[order], plan.end), rates[:, order], plan.start)
-
-
-def _corners(plan: Trajectory, parts: Sequence[Part]) -> tuple[float, ...]:
-    """Times [s] of the plan at which its path has a corner."""
-    ends, starts = ([part for part in parts if part.moves and part.rates[side] == 0.0] for side in (1, 0))
-    times = [plan.breakpoints[part.spans[-1].segment] + part.spans[-1].end for part in ends]
-    times += [plan.breakpoints[part.spans[0].segment] + part.spans[0].start for part in starts]
-    return tuple(np.unique(times).tolist())

@@ -121,7 +121,8 @@ class Activity:
             if not accelerations[:, 2].any():
                 accelerations = _strictest(accelerations, two_sided=True)
             third_rows = _strictest(third_rows, two_sided=False)
-        return cls(speeds, *accelerations.swapaxes(0, 1), third_rows, points)
+        tangent, curvature, centre = accelerations.swapaxes(0, 1)
+        return cls(speeds, tangent, curvature, centre, third_rows, points)
 
     @property
     def _control(self) -> Array:
@@ -208,7 +209,9 @@ def _strictest(rows: Array, two_sided: bool) -> Array:
         return rows
     if two_sided:
         return largest[None]
-    return np.stack([rows[own, :, :, cells].transpose(1, 2, 0) for own in (shares.argmax(axis=0), shares.argmin(axis=0))])
+    return np.stack(
+        [rows[own, :, :, cells].transpose(1, 2, 0) for own in (shares.argmax(axis=0), shares.argmin(axis=0))]
+    )
 
 
 def _check_direction(bound: Bound, shares: Array, times: Array) -> None:

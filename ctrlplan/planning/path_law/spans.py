@@ -17,6 +17,9 @@ _STILL = 1e-9
 _ROUNDING = 64.0 * float(np.finfo(float).eps)
 """Duration of a segment, relative to the times of the plan, that is rounding."""
 
+_ANGLE = 1e-6
+"""Difference of directions on both sides of a stop that is rounding."""
+
 _NEAR = 0.01
 """Distance from the end of a span at which its velocity is compared with that at twice the distance."""
 
@@ -213,6 +216,47 @@ def spans_of(plan: Trajectory, stops: bool, edges: Sequence[float], origin: floa
         for k in range(len(spans) - 1)
     ]
     return spans, joints
+
+
+def corner_times(plan: Trajectory, lap: bool) -> tuple[float, ...]:
+    """Times [s] at which a plan is at rest or must stop because its direction changes.
+
+    If `lap`, with those of a corner between the end and the start of a cyclic plan.
+    """
+    start = plan.start
+    own = plan.shift(-start)  # so that times have full precision
+    spans, joints = spans_of(own, True, (), start)
+    corners = [k for k, joint in enumerate(joints, 1) if joint.stops and _is_corner(own, spans[:k], spans[k:])]
+    closing = closing_joint(own) if lap and own.is_cyclic else None
+    if closing is not None and closing.corner:
+        corners = [0, *corners, len(spans)]
+    times = [float(own.breakpoints[span.segment] + span.start) for span in spans] + [own.end]
+    return tuple(start + times[k] for k in corners)
+
+
+def _is_corner(plan: Trajectory, before: Sequence[Span], after: Sequence[Span]) -> bool:
+    """Whether a plan stops between spans from motion, or at rest, also for a dwell, before another direction."""
+    if any(span.moves and not span.rests[side] for span, side in ((before[-1], 1), (after[0], 0))):
+        return True
+    last = next((span for span in reversed(before) if span.moves), None)
+    first = next((span for span in after if span.moves), None)
+    if last is None or first is None:
+        return False
+    peaks = plan.peak(1)
+    moving = peaks > 0.0
+    tangents = [_direction(plan, *end)[moving] / peaks[moving] for end in ((last, 1), (first, 0))]
+    sizes = [float(np.linalg.norm(tangent)) for tangent in tangents]
+    if not all(0.0 < size < np.inf for size in sizes):
+        return False
+    return bool((np.abs(tangents[0] / sizes[0] - tangents[1] / sizes[1]) > _ANGLE).any())
+
+
+def _direction(plan: Trajectory, span: Span, side: int) -> Array:
+    """Direction (naxes,) in which a plan moves at an end of a span, by the lowest derivative that is not 0 there."""
+    power = round(span.rests[side])
+    s = np.array([span.end if side else span.start])
+    found: Array = plan.segments_jet(np.array([span.segment]), s, power + 1)[power + 1, :, 0]
+    return -found if side and power % 2 else found
 
 
 def _powers(velocities: Array) -> list[list[float]]:

@@ -31,7 +31,7 @@ class _Point(NamedTuple):
     ratio: float = 1.0
 
 
-def stopping(plan: Trajectory, order: int, lap: bool) -> tuple[Trajectory, tuple[float, ...]]:
+def stopping(plan: Trajectory, order: int, lap: bool) -> Trajectory:
     """Plan with the same path and stops whose derivatives below an order are continuous, from time 0 on.
 
     At stops they are 0. Where the plan moves on in its direction with another speed,
@@ -49,10 +49,8 @@ def stopping(plan: Trajectory, order: int, lap: bool) -> tuple[Trajectory, tuple
 
     Returns
     -------
-    plan : Trajectory
+    Trajectory
         The plan; at its ends it has the speed of the given one.
-    corners : tuple of float
-        Times [s] of the given plan at which it stops at corners of the path.
     """
     start = plan.start
     own = plan.shift(-start)  # so that times have full precision
@@ -77,8 +75,7 @@ def stopping(plan: Trajectory, order: int, lap: bool) -> tuple[Trajectory, tuple
     for segment, row in enumerate(rows):
         table[: len(row), segment, 0] = row
     law = PiecewisePolynomial(np.concatenate([[0.0], np.cumsum(lengths)]), table[::-1], labels=["s"])
-    corners = [k for k, joint in enumerate(joints_and_ends) if joint is not None and joint.corner]
-    return Retimed(own, law), tuple(start + times[k] for k in corners)
+    return Retimed(own, law)
 
 
 def _point(before: Span | None, after: Span | None, joint: Joint | None, order: int) -> _Point:

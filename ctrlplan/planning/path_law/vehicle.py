@@ -82,7 +82,7 @@ def fastest_segment_law(part: PathPlan, limited: Limited, orders: Sequence[int])
     bounds = _over_time(partial(_fastest_rates, forms), 0, 1) if 1 in orders else []
     for axis, k in enumerate(second, 1):
         bounds += _over_time(partial(_differences, forms, k), axis, 2)
-    return fastest_law(virtual, bounds, virtual.start, (0.0, 0.0)).plan.law
+    return fastest_law(virtual, bounds, virtual.start, (0.0, 0.0)).law
 
 
 def _check_signs(forms: _Forms, orders: Sequence[int]) -> None:
