@@ -682,10 +682,14 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
         The constraints, of which all nodes are.
     places : ndarray
         As of the pattern.
+
+    Notes
+    -----
+    Products of arrays of one shape take half the time of those that are spread over a
+    further axis.
     """
-    order, own, count = pattern.order, pattern.own, len(times)
-    angle = np.zeros((count + 1, count))  # the last row for functions without a cosine
-    np.subtract(times, times[:, None], out=angle[:-1])
+    order, own, apart = pattern.order, pattern.own, pattern.apart
+    angle = times - times.take(pattern.waypoints)[:, None]  # of each function and waypoint
     if half:
         angle *= half
         sine, cosine = np.sin(angle), np.cos(angle)
@@ -693,36 +697,46 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
         factors += own
         ratio = cosine - own
         ratio /= factors
-        sine *= half
-        factors, ratio, cosine, sine = np.concatenate((factors, ratio, cosine, sine)).take(pattern.picks, axis=0)
+        odd, bends = _turned(pattern, half)
+        sine *= odd
+        cosine[::2] = 1.0
     else:
-        factors = angle + own
-        factors, ratio = np.concatenate((factors, (1.0 - own) / factors)).take(pattern.picks[:2], axis=0)
-    sums = np.zeros((max(order, 1) + 1, *ratio.shape))  # V e_k
-    value, higher = sums[0], sums[1:]
+        factors = angle
+        factors += own
+        ratio = apart / factors
+    sums = np.zeros((max(order, 1) + 1, *own.shape))  # e_k, then V e_k
+    value, rows = sums[0], list(sums)
     value[0] = 1.0
-    np.multiply.accumulate(factors[:-1], axis=0, out=value[1:])
+    np.multiply.accumulate(factors[:-1], 0, None, value[1:])
     ratio = ratio[:-1]
     terms = ratio
     for k in range(1, order + 1):
-        np.add.accumulate(terms, axis=0, out=sums[k, 1:])
+        np.add.accumulate(terms, 0, None, rows[k][1:])
         if k < order:
-            terms = ratio * sums[k, :-1]
-    higher *= value
+            terms = ratio * rows[k][:-1]
     if half:
-        turned = sine * sums[:-1]
-        sums *= cosine
-        higher -= turned
-        if order > 1:
-            highest = sums[2:]
-            highest -= _reduction(pattern, half) * sums[:-2]
-    return sums.ravel().take(places).T
+        turned = [cosine]
+        for k in range(1, order + 1):
+            row = cosine * rows[k]
+            row -= sine * rows[k - 1] if k > 1 else sine
+            if k > 1:
+                row -= bends[k - 2] * turned[k - 2]
+            turned.append(row)
+        for k in range(1, order + 1):
+            np.multiply(turned[k], value, rows[k])
+        value *= cosine
+    else:
+        for row in rows[1:]:
+            row *= value
+    return sums.take(places).T
 
 
 @lru_cache(maxsize=256)
-def _reduction(pattern: Pattern, half: float) -> Array:
-    """Reduction of sums 2 and 3 by powers of cosines, (order - 1, nconstraints, nwaypoints)."""
-    return readonly((half * half) * pattern.cosines)
+def _turned(pattern: Pattern, half: float) -> tuple[Array, list[Array]]:
+    """Half of alpha for functions with a cosine, else 0, and reductions of sums 2 and 3 by powers of cosines."""
+    odd = half * (np.arange(len(pattern.at)) % 2.0)
+    spread = np.repeat(odd[:, None], pattern.nwaypoints, axis=1)
+    return readonly(spread), list(readonly((half * half) * pattern.cosines))
 
 
 def _next(ratio: Array, lower: Array | Sequence[Array], bend: float) -> Array:
@@ -947,17 +961,13 @@ class Pattern:
 
     @cached_property
     def own(self) -> Array:
-        """1 for a node (rows) at the waypoint itself, else 0, with a last row of 1, (nwaypoints + 1, nwaypoints)."""
-        return readonly(np.vstack([np.eye(self.nwaypoints), np.ones(self.nwaypoints)]))
+        """1 for the node of a constraint (rows) at the waypoint itself, else 0, (nconstraints, nwaypoints)."""
+        return readonly((self.waypoints[:, None] == np.arange(self.nwaypoints)).astype(float))
 
     @cached_property
-    def picks(self) -> NDArray[np.intp]:
-        """Rows of the factors, ratios, cosines and sines of `_products_at_nodes` by function, (4, nconstraints)."""
-        rows = self.nwaypoints + 1
-        turned = np.where(np.arange(len(self.at)) % 2 == 1, self.waypoints, self.nwaypoints)
-        found = np.array([self.waypoints, rows + self.waypoints, 2 * rows + turned, 3 * rows + turned])
-        found.flags.writeable = False
-        return found
+    def apart(self) -> Array:
+        """The opposite, 0 for the node at the waypoint itself, else 1."""
+        return readonly(1.0 - self.own)
 
     @cached_property
     def zeros(self) -> NDArray[np.intp]:
