@@ -112,18 +112,23 @@ class _Search:
 
     def __init__(self, problem: Problem, start: Array) -> None:
         spline = problem.spline
-        self._index, self._size, self._bandwidth = spline.index, spline.size, spline.bandwidth
+        self._index, self._size, self._bandwidth = spline.index.T.copy(), spline.size, spline.bandwidth
         self._fixed, self._scale = spline.fixed, np.where(spline.fixed, 1.0, start)
         self._floor, self._ceiling = 1.0 / problem.trust, min(problem.trust, _FAR)
         self._accuracy = problem.accuracy
         self._start = np.where(spline.fixed, start, 1.0)
-        own = self._scale[spline.index]
-        self._points, self._weights = problem.points * own[:, None], problem.weights
-        self._rows, self._upper, self._lower = problem.rows * own[:, None], problem.upper, problem.lower
-        self._both = np.concatenate([self._points, self._rows], axis=1)
-        self._pairs = [(i, j) for i in range(len(own)) for j in range(i, len(own))]
-        ends = np.sort(np.stack([self._index[[i, j]] for i, j in self._pairs]), axis=1)
-        self._place = (ends[:, 1] - ends[:, 0]) * self._size + ends[:, 0]  # in the lower bands
+        # By cells, for which products of matrices are fast.
+        both = np.concatenate([problem.points, problem.rows], axis=1).transpose(2, 0, 1)
+        self._both = np.multiply(both, self._scale[self._index][:, :, None], order="C")
+        self._points, self._rows = np.split(self._both, [problem.points.shape[1]], axis=2)
+        self._weights, self._upper, self._lower = (
+            np.ascontiguousarray(own.T) for own in (problem.weights, problem.upper, problem.lower)
+        )
+        self._two = self._lower.shape[1]
+        size = self._index.shape[1]
+        first, second = self._pairs = np.triu_indices(size)
+        ends = np.sort(np.stack([self._index[:, first], self._index[:, second]]), axis=0)
+        self._place = (ends[1] - ends[0]) * self._size + ends[0]  # in the lower bands
 
     def minimum(self) -> Array:
         """Coefficients at the optimum."""
@@ -167,10 +172,10 @@ class _Search:
         """Whether all limits hold, up to the accuracy and rounding of the rows, whose terms may be far above them."""
         if missed.min() > -self._accuracy:
             return True
-        terms = _applied(np.abs(self._rows), np.abs(x)[self._index])
+        terms = _by_cells(np.abs(self._rows), np.abs(x)[self._index])
         rounding = np.zeros(missed.size)
         rounding[: self._upper.size] = terms.ravel()
-        rounding[self._upper.size : self._upper.size + self._lower.size] = terms[: len(self._lower)].ravel()
+        rounding[self._upper.size : self._upper.size + self._lower.size] = terms[:, : self._two].ravel()
         return bool((missed + _ROUNDING * rounding).min() > -self._accuracy)
 
     def _raise_infeasible(self) -> NoReturn:
@@ -185,18 +190,18 @@ class _Search:
         )
 
     def _duration(self, x: Array) -> float:
-        return float((self._weights / np.sqrt(_applied(self._points, x[self._index]))).sum())
+        return float((self._weights / np.sqrt(_by_cells(self._points, x[self._index]))).sum())
 
     def _objective(self, x: Array) -> tuple[Array, Array]:
         """Gradient of the duration, and second derivatives by the squared rates at the points."""
-        b = _applied(self._points, x[self._index])
+        b = _by_cells(self._points, x[self._index])
         first = -0.5 * self._weights / (b * np.sqrt(b))
         return self._gathered(self._points, first), -1.5 * first / b
 
     def _slacks(self, x: Array) -> Array:
         """Distances from all limits; 1 for a prescribed coefficient."""
-        values = _applied(self._rows, x[self._index])
-        below = values[: len(self._lower)] - self._lower
+        values = _by_cells(self._rows, x[self._index])
+        below = values[:, : self._two] - self._lower
         ends = (np.where(self._fixed, 1.0, own) for own in (x - self._floor, self._ceiling - x))
         return np.concatenate([(self._upper - values).ravel(), below.ravel(), *ends])
 
@@ -207,14 +212,14 @@ class _Search:
 
     def _changes(self, dx: Array) -> Array:
         """Changes of the slacks with coefficients."""
-        values = _applied(self._rows, dx[self._index])
-        return np.concatenate([-values.ravel(), values[: len(self._lower)].ravel(), dx, -dx])
+        values = _by_cells(self._rows, dx[self._index])
+        return np.concatenate([-values.ravel(), values[:, : self._two].ravel(), dx, -dx])
 
     def _by_row(self, values: Array, sign: float) -> tuple[Array, Array]:
         """Values of the slacks of both limits of each row, with a sign of the upper one; those of coefficients."""
         count, two = self._upper.size, self._lower.size
         rows = sign * values[:count].reshape(self._upper.shape)
-        rows[: len(self._lower)] += values[count : count + two].reshape(self._lower.shape)
+        rows[:, : self._two] += values[count : count + two].reshape(self._lower.shape)
         low, high = values[count + two :].reshape(2, -1)
         return rows, low + sign * high
 
@@ -224,18 +229,18 @@ class _Search:
         return self._gathered(self._rows, rows) + own
 
     def _gathered(self, rows: Array, values: Array) -> Array:
-        """Transposed products of rows (size, nrows, ncells) with values (nrows, ncells)."""
-        found = np.einsum("mrc,rc->mc", rows, values)
-        return _summed(self._index, found, self._size)
+        """Transposed products of rows (ncells, size, nrows) with values (ncells, nrows)."""
+        return _summed(self._index, rows @ values[:, :, None], self._size)
 
     def _solver(self, curvature: Array, stiffness: Array) -> Callable[[Array], Array]:
         """Solution of the equations of a step."""
         of_rows, own = self._by_row(stiffness, 1.0)
-        weighted = self._both * np.concatenate([curvature, of_rows])
-        terms = np.concatenate([np.add.reduce(own * self._both[i:], axis=1) for i, own in enumerate(weighted)])
+        weights = np.concatenate([curvature, of_rows], axis=1)
+        first, second = self._pairs
+        terms = ((self._both * weights[:, None]) @ self._both.transpose(0, 2, 1))[:, first, second]
         if self._fixed.any():
             fixed = self._fixed[self._index]
-            terms[np.stack([fixed[i] | fixed[j] for i, j in self._pairs])] = 0.0
+            terms[fixed[:, first] | fixed[:, second]] = 0.0
         bands = _summed(self._place, terms, (self._bandwidth + 1) * self._size).reshape(self._bandwidth + 1, self._size)
         bands[0] += np.where(self._fixed, 1.0, own)
         factor, failed = dpbtrf(bands, lower=1)
@@ -251,6 +256,11 @@ def _applied(rows: Array, x: Array) -> Array:
     for row, own in zip(rows[1:], x[1:], strict=True):
         found += row * own
     return found
+
+
+def _by_cells(rows: Array, x: Array) -> Array:
+    """Products (ncells, nrows) of rows (ncells, size, nrows) with coefficients (ncells, size)."""
+    return np.asarray((x[:, None] @ rows)[:, 0])
 
 
 def _summed(index: NDArray[np.intp], values: Array, size: int) -> Array:
