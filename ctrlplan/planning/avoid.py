@@ -42,7 +42,7 @@ _FINE = 4  # with finer ones in between
 _POINTS = 4  # maximum number of via points, or one more than there are corners
 _TRIES = 8  # optimisations with the same via points and further samples
 _WIDER = 0.01  # extra clearance of a second path, relative to the path length
-_NARROW = 0.1  # part of the clearance without which paths through narrow gaps are tried,
+_NARROW = 0.1, 0.5  # parts of the clearance without which paths through narrow gaps are tried,
 _SHORTER = 0.95  # if they are shorter than this multiple of the others
 _NEARLY = 0.01  # part of the clearance that may be missing in a gap of which a warning is issued
 _STEP = 1e-7  # step of finite differences, for unknowns of magnitude 1
@@ -233,9 +233,12 @@ def _through_gap(task: _Task, build: Build, shortest: float) -> list[Avoidance]:
     Polygons around obstacles block gaps that are slightly wider than required.
     """
     distance = task.load + task.required
-    polyline = _polylines(task, -_NARROW * distance)[0]
-    length = sum(map(_length, polyline))
-    if not length < _SHORTER * shortest:
+    for part in _NARROW:
+        polyline = _polylines(task, -part * distance)[0]
+        length = sum(map(_length, polyline))
+        if length < _SHORTER * shortest:
+            break
+    else:
         return []
     plan, certificate = _search(task, build, polyline)
     if certificate.certified:

@@ -310,21 +310,23 @@ def test_a_gap_too_narrow_is_said_with_what_it_would_allow():
 
 
 @pytest.mark.parametrize("wider", [1e-3, 5e-3, 0.02])
-def test_a_gap_slightly_wider_than_required_is_passed(wider):
-    """Between discs at (5, 2 + g) and (5, 2 - g) with the radius 2: polygons around them overlap."""
+@pytest.mark.parametrize("radius", [2.0, 8.0])
+def test_a_gap_slightly_wider_than_required_is_passed(wider, radius):
+    """Between discs at (5, 2 + g) and (5, 2 - g): polygons around them overlap."""
     half = 0.5 * (1.0 + wider)
-    plan = cp.PolySpline(rest([0.0, 0.0], [10.0, 0.0], 10.0))
+    plan = cp.PolySpline(rest([-radius, 0.0], [10.0 + radius, 0.0], 10.0))
+    far = half + 2.0 * radius
     obstacles = [
-        Disc((5.0, 4.0 + half), 2.0),
-        Disc((5.0, -half), 2.0),
-        Rectangle((4.5, 5.5), (6.0 + half, 14.0)),
-        Rectangle((4.5, 5.5), (-10.0, -2.0 - half)),
+        Disc((5.0, 2.0 + half + radius), radius),
+        Disc((5.0, 2.0 - half - radius), radius),
+        Rectangle((4.5, 5.5), (2.0 + far, 10.0 + far)),
+        Rectangle((4.5, 5.5), (-6.0 - far, 2.0 - far)),
     ]
     found = avoid(plan, obstacles, clearance=0.5)
     check(plan, found.plan, obstacles, gap=0.5)
     assert found.clearance.certified
     assert abs(found.plan(5.0)[1] - 2.0) < 0.5
-    assert plan_length(found.plan) < 11.5
+    assert plan_length(found.plan) < 11.5 + 2.0 * radius
 
 
 @pytest.mark.parametrize("wider", [-5e-3, 0.0, 1e-4])
