@@ -85,10 +85,18 @@ def test_fastest_on_a_path(benchmark, capsys, count, naxes):
 
 
 @pytest.mark.benchmark(group="path law")
-@pytest.mark.parametrize("count", [5, 50])
-def test_fastest_on_a_path_with_limited_jerk(benchmark, capsys, count):
-    """No peer is installed that limits the jerk on a path: the ratio is that to the same without this limit."""
-    plan, limits = random_path(count, 3), LIMITS | {"jerk": 20.0}
+@pytest.mark.parametrize(
+    ("kind", "count", "naxes"),
+    [("spline", 5, 3), ("spline", 50, 3), ("spline", 50, 7), ("lines", 50, 3), ("lines", 50, 7)],
+)
+def test_fastest_on_a_path_with_limited_jerk(benchmark, capsys, kind, count, naxes):
+    """No peer is installed that limits the jerk on a path: the ratio is that to the same without this limit.
+
+    Lines have a stop at each waypoint. Goal: at most 0.5 s for 50 waypoints.
+    """
+    plan, limits = random_path(count, naxes), LIMITS | {"jerk": 20.0}
+    if kind == "lines":
+        plan = cp.PiecewiseSpline([cp.Waypoint(point.time, point.position) for point in plan.waypoints])
     found, without = (cp.fastest(plan, own, hold="path") for own in (limits, LIMITS))
     assert found.margins.satisfied
     times = []
@@ -104,6 +112,6 @@ def test_fastest_on_a_path_with_limited_jerk(benchmark, capsys, count):
     benchmark.extra_info["ratio"] = own / other
     with capsys.disabled():
         print(
-            f"\n{count} waypoints, jerk: {own:.0f} ms, without {other:.0f} ms, ratio {own / other:.2f}; "
-            f"duration {found.duration:.4f} s, without {without.duration:.4f} s"
+            f"\n{kind}, {count} waypoints, {naxes} axes, jerk: {own:.0f} ms, without {other:.0f} ms, "
+            f"ratio {own / other:.2f}; duration {found.duration:.4f} s, without {without.duration:.4f} s"
         )
