@@ -682,12 +682,8 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
         The constraints, of which all nodes are.
     places : ndarray
         As of the pattern.
-
-    Notes
-    -----
-    Products of arrays of one shape take half the time of those that are spread over a
-    further axis.
     """
+    # Products of arrays of one shape take half the time of those that are spread over a further axis.
     order, own, apart = pattern.order, pattern.own, pattern.apart
     angle = times - times.take(pattern.waypoints)[:, None]  # of each function and waypoint
     if half:
@@ -697,7 +693,7 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
         factors += own
         ratio = cosine - own
         ratio /= factors
-        odd, bends = _turned(pattern, half)
+        odd, bends = _odd_functions(pattern, half)
         sine *= odd
         cosine[::2] = 1.0
     else:
@@ -715,15 +711,9 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
         if k < order:
             terms = ratio * rows[k][:-1]
     if half:
-        turned = [cosine]
-        for k in range(1, order + 1):
-            row = cosine * rows[k]
-            row -= sine * rows[k - 1] if k > 1 else sine
-            if k > 1:
-                row -= bends[k - 2] * turned[k - 2]
-            turned.append(row)
-        for k in range(1, order + 1):
-            np.multiply(turned[k], value, rows[k])
+        turned = _with_cosine(rows[: order + 1], sine, cosine, bends)
+        for row, one in zip(rows[1:], turned, strict=False):
+            np.multiply(one, value, row)
         value *= cosine
     else:
         for row in rows[1:]:
@@ -731,12 +721,22 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
     return sums.take(places).T
 
 
+def _with_cosine(rows: Sequence[Array], sine: Array, cosine: Array, bends: Sequence[Array]) -> list[Array]:
+    """Sums e_1, e_2, ... with one more factor c(h) cosine - S(h) sine, reduced by powers of cosines."""
+    found = [cosine]
+    for k in range(1, len(rows)):
+        row = cosine * rows[k]
+        row -= sine * rows[k - 1] if k > 1 else sine
+        if k > 1:
+            row -= bends[k - 2] * found[k - 2]
+        found.append(row)
+    return found[1:]
+
+
 @lru_cache(maxsize=256)
-def _turned(pattern: Pattern, half: float) -> tuple[Array, list[Array]]:
+def _odd_functions(pattern: Pattern, half: float) -> tuple[Array, list[Array]]:
     """Half of alpha for functions with a cosine, else 0, and reductions of sums 2 and 3 by powers of cosines."""
-    odd = half * (np.arange(len(pattern.at)) % 2.0)
-    spread = np.repeat(odd[:, None], pattern.nwaypoints, axis=1)
-    return readonly(spread), list(readonly((half * half) * pattern.cosines))
+    return readonly(half * pattern.odd), list(readonly((half * half) * pattern.cosines))
 
 
 def _next(ratio: Array, lower: Array | Sequence[Array], bend: float) -> Array:
@@ -968,6 +968,12 @@ class Pattern:
     def apart(self) -> Array:
         """The opposite, 0 for the node at the waypoint itself, else 1."""
         return readonly(1.0 - self.own)
+
+    @cached_property
+    def odd(self) -> Array:
+        """1 for functions with a cosine, those of odd numbers, else 0, (nconstraints, nwaypoints)."""
+        numbers = np.arange(len(self.at)) % 2.0
+        return readonly(np.repeat(numbers[:, None], self.nwaypoints, axis=1))
 
     @cached_property
     def zeros(self) -> NDArray[np.intp]:
