@@ -142,6 +142,16 @@ class Snapshot:
             raise ValueError("internal signals must come from a network, got a run by python-control")
         return self.signals()
 
+    def at(self, places: NDArray[np.intp]) -> Snapshot:
+        """Snapshot at some of the times; outputs and signals are evaluated at all times, once."""
+        return Snapshot(
+            self.t[places],
+            self.x[:, places],
+            self.u[:, places],
+            lambda: self.y[:, places],
+            None if self.signals is None else lambda: self.w[:, places],
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Watched:

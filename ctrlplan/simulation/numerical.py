@@ -397,7 +397,7 @@ class Attempt(Generic[S]):
     def _snapshot(self, t: Array, x: Array) -> Snapshot:
         ninputs = self.job.prepared.ninputs
         if not ninputs:
-            return _seen(self.solver, t, x, np.zeros((0, t.size)), partial(self.time_signals.at, t))
+            return _seen(self.solver, t, x, np.zeros((0, t.size)), partial(self.time_values, t))
         known = self.time_values(t)  # the caller may change samples later
         return _seen(self.solver, t, x, known[:ninputs], lambda: known)
 

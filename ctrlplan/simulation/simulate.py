@@ -282,6 +282,7 @@ def _response(job: Job, record: Record, later: bool) -> tuple[SimulationResponse
     prepared = job.prepared
     found = _Occurrences(record)
     times, states = record.times, record.states
+    places = np.arange(times.size)
     if times is not job.times and not np.array_equal(times, job.times):
         places = np.searchsorted(times, job.times[job.times <= times[-1]])
         times, states = times[places], states[:, places]
@@ -290,7 +291,10 @@ def _response(job: Job, record: Record, later: bool) -> tuple[SimulationResponse
         last = stop.time
         end = record.state_at(int(np.searchsorted(record.times, last, side="right")) - 1, last)
         times, states = np.append(times[times < last], last), np.column_stack([states[:, times < last], end])
-    seen = record.snapshot(times, states)
+    if record.watched and record.is_pure and stop is None:
+        seen = found.seen.at(places)  # events require signals at all times of the record
+    else:
+        seen = record.snapshot(times, states)
 
     def outputs() -> Array:
         return seen.y.reshape(len(prepared.output_labels), times.size)
@@ -338,7 +342,8 @@ class _Occurrences:
         return sorted(every, key=lambda one: one.time)
 
     @cached_property
-    def _seen(self) -> Snapshot:
+    def seen(self) -> Snapshot:
+        """Signals at all times of the record."""
         return self._record.snapshot(self._record.times, self._record.states)
 
     def _locate(self, wanted: Sequence[int]) -> None:
@@ -348,7 +353,7 @@ class _Occurrences:
         with passing_interruptions():
             for k in missing:
                 entry = record.watched[k]
-                values = entry.value(self._seen)
+                values = entry.value(self.seen)
                 self._found[k] = crossings(entry, record.times, values, partial(_value_at, record, entry))
 
 

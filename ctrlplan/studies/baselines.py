@@ -64,10 +64,17 @@ def baseline_plans(
     jerk = optimize_waypoints(freed, 3, labels=spline.labels).plan
     degree = max(max(piece.degree) for piece in spline.segments)
     name = f"{_DEGREES.get(degree, f'degree {degree}')}{' per segment' if len(points) > 2 else ''}"
-    t = np.linspace(spline.start, spline.end, 101)
-    if np.abs(jerk.jet(t, 0) - spline.jet(t, 0)).max() <= 1e-9 * np.abs(spline.jet(t, 0)).max():
+    if are_equal(jerk, spline):
         return plans | {f"{name} (minimum jerk)": spline}
     return plans | {name: spline, "minimum jerk": jerk}
+
+
+def are_equal(one: Trajectory, other: Trajectory) -> bool:
+    """Whether two plans have the same motion, to 1e-9 of its largest position."""
+    if (one.start, one.end) != (other.start, other.end):
+        return False
+    t = np.linspace(one.start, one.end, 101)
+    return bool(np.abs(one.jet(t, 0) - other.jet(t, 0)).max() <= 1e-9 * np.abs(other.jet(t, 0)).max())
 
 
 def profiles(

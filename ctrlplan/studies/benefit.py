@@ -19,7 +19,7 @@ from ctrlplan.planning.limits import Limited
 from ctrlplan.planning.quantities import System as Quantified
 from ctrlplan.simulation import state_space
 from ctrlplan.simulation.built_forms import shared_forms
-from ctrlplan.studies.baselines import baseline_plans, derivative_limits, peak_limits, profiles
+from ctrlplan.studies.baselines import are_equal, baseline_plans, derivative_limits, peak_limits, profiles
 from ctrlplan.studies.comparison import Comparison, comparison_of, finite_or_none
 from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.grids import Grid
@@ -320,12 +320,15 @@ class _Setting:
         scaled = _scaled(self.experiment.waypoints, factor)
         shapes: dict[str, Trajectory] = {f"{a:g}": TrigSpline(scaled, alpha=a, warn=False) for a in self.choices.alphas}
         baselines = self.baselines(scaled)
+        equal = _equal_baselines(shapes, baselines)
+        plans = {name: plan for name, plan in (shapes | baselines).items() if name not in equal}
         same = {f"{a:g}": PLANNED for a in self.choices.alphas if a == self.alpha} | {name: name for name in baselines}
-        known = {name: run for name, run in same.items() if factor == 1.0 and run in own.runs}
-        ran = self._completed(scaled, shapes | baselines, decisive, known, own)
+        known = {name: same[name] for name in plans if factor == 1.0 and same.get(name) in own.runs}
+        ran = self._completed(scaled, plans, decisive, known, own)
         worst, none = dict.fromkeys(decisive, np.inf), dict.fromkeys(decisive, np.nan)
-        rows = {name: worst | ran.metrics.get(name, {}) for name in (*shapes, *baselines)}
-        stopped = [name for name, run in ran.runs.items() if run.stop is not None]
+        run_of = {name: equal.get(name, name) for name in (*shapes, *baselines)}
+        rows = {name: worst | ran.metrics.get(run, {}) for name, run in run_of.items()}
+        stopped = [name for name, run in run_of.items() if run in ran.runs and ran.runs[run].stop is not None]
         return rows | {name: worst if name in shapes else none for name in stopped}, list(baselines)
 
     def _completed(
@@ -350,6 +353,17 @@ class _Setting:
             {name: own.metrics[run] for name, run in known.items()} | ran.metrics,
             {name: own.runs[run] for name, run in known.items()} | ran.runs,
         )
+
+
+def _equal_baselines(shapes: Mapping[str, Trajectory], baselines: Mapping[str, Trajectory]) -> dict[str, str]:
+    """Trigonometric plans that a baseline is equal to, with its name: with alpha = 0 they are polynomials."""
+    polynomials = {shape: plan for shape, plan in shapes.items() if not float(shape)}
+    return {
+        shape: name
+        for shape, plan in polynomials.items()
+        for name, baseline in baselines.items()
+        if are_equal(plan, baseline)
+    }
 
 
 def _grids(setting: _Setting, found: Comparison, decisive: Sequence[str], own: Measured) -> tuple[Grid, ...]:

@@ -73,7 +73,7 @@ def many_digits(
         return np.array([[float(value) for value in column] for column in columns]).T
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=256)
 def _known_series(
     u: Decimal, order: int, alpha: Decimal, nodes: tuple[Decimal, ...], fold: Decimal, digits: int
 ) -> list[Series]:

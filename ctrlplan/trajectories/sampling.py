@@ -330,7 +330,7 @@ class Collocation(NamedTuple):
     products: Array
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def collocation(alpha: float, size: int) -> Collocation:
     """Points for polynomials of `size` coefficients, or for trigonometric polynomials of degree size // 2.
 

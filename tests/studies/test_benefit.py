@@ -729,11 +729,14 @@ def test_no_plan_is_run_twice():
     points = [cp.Waypoint.from_jets(w.time, y=[w.position[0], 0.0, 0.0]) for w in MOVE]
     found = worth(build, points, TIMES, alpha=1.0, mode=(20.0, 0.1), **TABLES)
     own = len(found.comparison.plans)
-    assert len(ran) == own + 2 + (3 + own - 1)  # then alpha = 0 and 3, then all of the other duration
+    # Then alpha = 3, then all of the other duration. The quintic is the trigonometric plan with alpha = 0.
+    assert len(ran) == own + 1 + (2 + own - 1)
+    alone = cp.compare(build, {"polynomial": cp.TrigSpline(points, alpha=0.0)}, TIMES, waypoints=points)
     for grid in found.grids:
         row = int(np.flatnonzero(grid.durations == 1.0)[0])
         key = next(k for k, m in found.comparison.measures.items() if m.title == grid.title)
         assert grid.values[row, 1] == found.comparison.metrics["trigonometric"][key]
+        assert grid.values[row, 0] == pytest.approx(alone.metrics["polynomial"][key], rel=1e-9)
         for name, values in grid.baselines.items():
             assert values[row] == found.comparison.metrics[name][key] or math.isnan(values[row])
 
