@@ -9,6 +9,7 @@ durations decrease. The last one is a local minimum.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -19,8 +20,9 @@ from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.interior_point import Problem, minimum
 from ctrlplan.planning.path_law.law import changes, losses, problem_of
-from ctrlplan.planning.path_law.rows import SMOOTH_POINTS, Activity
+from ctrlplan.planning.path_law.rows import POINTS, SMOOTH_POINTS, Activity
 from ctrlplan.planning.path_law.spans import Part, Rates, parts_of
+from ctrlplan.planning.path_law.sweep import check_ends
 from ctrlplan.trajectories import PiecewisePolynomial, Retimed, Trajectory
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 
@@ -106,6 +108,7 @@ def _within_limits(problems: _Problems, x: Array) -> tuple[_Problems, Array]:
             return problems, x
         if division < _DIVISIONS:
             problems, x = problems.divided(np.where(excess > _NEARLY, _PIECES, 1), problems.local(x))
+    problems.check_ends()
     raise ValueError(
         "limits must be satisfied with the speeds at the ends of the plan and at corners, but no such time law is "
         "found; lower these speeds, raise the limits, or choose free ends"
@@ -140,6 +143,13 @@ class _Problems:
         rate = 1.0 if self.prescribed else _START * _constant(self.grid, self.activity)
         return self._with_prescribed(np.full(self._spline.size, rate))
 
+    def check_ends(self) -> None:
+        """Raise for prescribed rates that limits of velocities and accelerations do not allow."""
+        bounds = [bound for bound in self._bounds if bound.order < 3]
+        if bounds:
+            rows = Activity.of(self.grid, bounds, POINTS, self._origin).rows(self.grid.length)
+            check_ends(self.grid, rows.with_reserve(POINTS.size, 0.0, *self.grid.ends(moving=True)).relaxed())
+
     def local(self, x: Array) -> Array:
         """Bernstein coefficients (degree + 1, ncells)."""
         return self._spline.coefficients(x)
@@ -170,12 +180,19 @@ class _Problems:
         """
         for _ in range(_ROUNDS):
             problem = self._about(x)
-            x = minimum(problem, x if self.prescribed else INSIDE * x)
+            x = self._minimum(problem, x)
             duration = problem.duration(x)
             gain, last = 1.0 - duration / last, duration
             if abs(gain) < _GAIN ** (2.0 / 3.0):
                 break
         return self.local(x), last
+
+    def _minimum(self, problem: Problem, x: Array) -> Array:
+        if not self.prescribed:
+            return minimum(problem, INSIDE * x)
+        with suppress(ValueError):
+            return minimum(problem, x)
+        return minimum(replace(problem, price=problem.duration(x)), x)  # where limits leave almost no freedom
 
     def _about(self, x: Array, shares: Array | None = None) -> Problem:
         rows = self.activity.rows(self.grid.length, self.local(x), shares)

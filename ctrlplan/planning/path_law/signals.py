@@ -277,6 +277,8 @@ class _Problems:
             try:
                 rows = self._signals.rows(self._spline.coefficients(x), reserves)
                 problem = replace(problem_of(self._grid, self._spline, rows), trust=trust, accuracy=_ACCURACY)
+                if self._grid.prescribed.any():  # no uniform rate satisfies the limits: excesses have a price
+                    problem = replace(problem, price=problem.duration(x))
                 tried = minimum(problem, x)
             except ValueError:  # the linearised limits cannot be satisfied near this solution
                 x, trust = best, trust**0.4 if solved else 4.0 * trust
