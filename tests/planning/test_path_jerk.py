@@ -444,6 +444,38 @@ def test_paths_with_given_speeds_satisfy_limits_of_the_jerk(count, naxes, speeds
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("count", "seed", "jerk"), [(3, 1, 10.0), (4, 2, 40.0), (5, 3, 100.0)])
+def test_given_speeds_on_a_path_are_those_of_a_nonlinear_program(count, seed, jerk):
+    """Limits of the jerk alone, b = 1 at both ends, and limits at the nodes of a fine grid, by IPOPT."""
+    casadi = pytest.importorskip("casadi")
+    points = np.random.default_rng(seed).normal(size=(2, count))
+    times = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points), axis=0)))
+    first = np.full((2, count), np.nan)
+    first[:, 0], first[:, -1] = points[:, 1] - points[:, 0], points[:, -1] - points[:, -2]
+    first /= np.linalg.norm(first, axis=0)
+    plan = PiecewiseSpline.from_arrays(times, points, derivatives={1: first}, warn=False)
+    cells = 1600
+    s = np.linspace(plan.start, plan.end, cells + 1)
+    h = s[1] - s[0]
+    b = casadi.MX.sym("b", cells + 1)
+    slope, bend = (b[2:] - b[:-2]) / (2 * h), (b[2:] - 2 * b[1:-1] + b[:-2]) / h**2
+    rows = [
+        casadi.sqrt(b[1:-1]) * (p3 * b[1:-1] + 1.5 * p2 * slope + 0.5 * p1 * bend)
+        for p1, p2, p3 in zip(*plan.jet(s[1:-1], 3)[1:], strict=True)
+    ]
+    time = 2 * h * casadi.sum1(1 / (casadi.sqrt(b[1:]) + casadi.sqrt(b[:-1])))
+    problem = {"x": b, "f": time, "g": casadi.vertcat(*rows)}
+    solver = casadi.nlpsol("solver", "ipopt", problem, {"ipopt.print_level": 0, "print_time": False})
+    low, high = np.full(cells + 1, 1e-4), np.full(cells + 1, np.inf)
+    low[[0, -1]] = high[[0, -1]] = 1.0
+    solved = solver(x0=1.0, lbx=low, ubx=high, lbg=-jerk, ubg=jerk)
+    assert solver.stats()["success"]
+    found = fastest(plan, {"jerk": jerk}, hold="path", ends="given")
+    assert 0.998 * float(solved["f"]) <= found.duration <= 1.01 * float(solved["f"])
+    check_limits(found.plan, {"jerk": jerk})
+
+
+@pytest.mark.slow
 def test_limits_of_the_jerk_far_above_use_cost_nothing():
     plan = random_path(5, 3, 1)
     without = fastest(plan, {"velocity": 2.0, "acceleration": 4.0}, hold="path").duration
