@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan import PiecewiseSpline, PolySpline, TrigSpline, Waypoint, fastest
@@ -324,13 +325,154 @@ def test_a_given_speed_at_its_limit():
     ("limits", "system", "message"),
     [
         (limits_of(0.9, 1, 5), None, "limits must be satisfied with the speeds at the ends, got y_d1 = 1 at 1 s"),
-        (limits_of(2, 0.3, 5), None, "limits must be satisfied with the speeds at the ends of the plan and at corners"),
+        # From 0.5 m/s over 1 m at 0.3 m/s^2 to sqrt(0.85) m/s.
+        (
+            limits_of(2, 0.3, 5),
+            None,
+            r"the speed at the end must be feasible .* at most 0\.9(18|19|20|21)\d* times it is",
+        ),
         ({"v": 0.9}, lambda jet: {"v": jet[1, 0]}, "limits must be satisfied with the speeds at the ends, got v = 1"),
     ],
 )
 def test_given_speeds_that_are_infeasible(limits, system, message):
     with pytest.raises(ValueError, match=message):
         fastest(FASTER, limits, system, hold="path", ends="given")
+
+
+def along_a_line(start, duration, speeds, length, direction=(1.0,)):
+    """From one speed to another one, with an acceleration of 0 at an end at rest."""
+    points = []
+    for time, place, speed in zip((start, start + duration), (0.0, length), speeds, strict=True):
+        jets = {f"y{k}": [place * c, speed * c] + [0.0] * int(speed == 0.0) for k, c in enumerate(direction)}
+        points.append(Waypoint.from_jets(time, **jets))
+    return PolySpline(points)
+
+
+def stops_in(share, time, jerk):
+    """Speed from which a plan stops, distance and duration: jerk -j for a share of the time of jerk j to the stop.
+
+    With a share of 0 no shorter distance is possible.
+    """
+    q = share
+    speed = jerk * time**2 * (0.5 + q - q**2 / 2)
+    return speed, jerk * time**3 * (1 / 6 + q / 2 + q**2 / 2 - q**3 / 6), (1 + q) * time
+
+
+@pytest.mark.parametrize("kind", ["derivatives", "quantities"])
+@pytest.mark.parametrize("acceleration", [None, 1e3])
+@pytest.mark.parametrize("share", [0.5, 0.1, 0.02])
+@pytest.mark.parametrize(("start", "reverse"), [(0.0, False), (-3.0, True), (1e9, False)])
+def test_a_stop_from_a_given_speed_by_the_jerk_alone(kind, acceleration, share, start, reverse):
+    """The speeds are 0.82, 0.985 and 0.9992 times those from which a plan stops in this distance at all."""
+    jerk = 3.0
+    speed, length, best = stops_in(share, 1.5, jerk)
+    speeds = (0.0, speed) if reverse else (speed, 0.0)
+    plan = along_a_line(start, 2.0 * length / speed, speeds, length, (1.0, -0.3))
+    limits, system = {"jerk": jerk}, None
+    if acceleration is not None:
+        limits["acceleration"] = acceleration
+    if kind == "quantities":
+        bound = cp.Limits(*((-2.0 * acceleration, 2.0 * acceleration) if acceleration else ()), rate=2.0 * jerk)
+        limits, system = {"push": bound}, lambda jet: {"push": 2.0 * jet[2, 0]}
+    found = fastest(plan, limits, system, hold="path", ends="given")
+    rounding = 8 * np.spacing(abs(start))
+    assert best * (1 - 1e-6) - rounding <= found.duration <= 1.005 * best + rounding
+    check_limits(found.plan, {"jerk": jerk})
+    assert found.margins.satisfied
+    moving = start if not reverse else found.plan.end
+    assert abs(found.plan.jet(moving, 1, left=reverse)[1, 0]) == pytest.approx(speed, rel=1e-6)
+
+
+@pytest.mark.parametrize("acceleration", [None, 1e3])
+@pytest.mark.parametrize(("speeds", "jerk"), [((0.5, 1.0), 5.0), ((1.0, 1.0), 0.01), ((1.0, 0.1), 1.0)])
+def test_both_speeds_given_by_the_jerk_alone(acceleration, speeds, jerk):
+    """Any accelerations at the ends and a constant jerk -j: (v_0 + v_1) T/2 + j T^3/12 is the length."""
+    plan = along_a_line(0.0, 2.0 / sum(speeds), speeds, 1.0)
+    limits = {"jerk": jerk} | ({"acceleration": acceleration} if acceleration else {})
+    found = fastest(plan, limits, hold="path", ends="given")
+    best = max(root.real for root in np.roots([jerk / 12, 0.0, sum(speeds) / 2, -1.0]) if abs(root.imag) < 1e-9)
+    assert best * (1 - 1e-9) <= found.duration <= 1.002 * best
+    check_limits(found.plan, limits)
+
+
+@pytest.mark.parametrize("share", [0.9, 0.99, 0.999])
+def test_a_speed_near_the_largest_one_that_is_braked(share):
+    """From v_0 to 0.3 m/s over 1 m: v_0^2 - 0.09 is a share of 2 a; constant jerk for 2 a/j, as for `from_half_to_one`.
+
+    Where the time is shorter, the acceleration at the start is below its limit: speeds follow from it.
+    """
+    acceleration, jerk, last = 1.0, 5.0, 0.3
+    first = np.sqrt(last**2 + 2 * acceleration * share)
+
+    # The acceleration falls from a_0 to -a in the time (a_0 + a)/j, and remains there.
+    def passed(peak):
+        fall = (peak + acceleration) / jerk
+        speed = first + peak * fall - jerk * fall**2 / 2
+        length = first * fall + peak * fall**2 / 2 - jerk * fall**3 / 6
+        return length + (speed**2 - last**2) / (2 * acceleration), fall + (speed - last) / acceleration
+
+    peak = brentq(lambda own: passed(own)[0] - 1.0, -acceleration, acceleration)
+    best = passed(peak)[1]
+    plan = along_a_line(0.0, 2.0 / (first + last), (first, last), 1.0)
+    found = fastest(plan, limits_of(5, acceleration, jerk), hold="path", ends="given")
+    assert best * (1 - 1e-9) <= found.duration <= 1.003 * best
+    check_limits(found.plan, limits_of(5, acceleration, jerk))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "naxes"), [(2, 7), (5, 3), (20, 2), (50, 3)])
+@pytest.mark.parametrize("speeds", [(1.0, 0.5), (0.0, 1.0), (2.0, 0.0)])
+def test_paths_with_given_speeds_satisfy_limits_of_the_jerk(count, naxes, speeds):
+    """They are little slower than with free ends, and much faster than the given plan."""
+    points = np.random.default_rng(3).normal(size=(naxes, count))
+    times = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points), axis=0)))
+    derivatives = np.full((2, naxes, count), np.nan)
+    for end, inner, speed in ((0, 1, speeds[0]), (-1, -2, speeds[1])):
+        chord = (points[:, inner] - points[:, end]) * (1.0 if end == 0 else -1.0)
+        derivatives[0, :, end] = speed * chord / np.linalg.norm(chord)
+        derivatives[1, :, end] = 0.0
+    plan = PiecewiseSpline.from_arrays(times, points, derivatives={1: derivatives[0], 2: derivatives[1]}, warn=False)
+    limits = {"velocity": 20.0, "jerk": 100.0}
+    found = fastest(plan, limits, hold="path", ends="given")
+    jet = np.abs(found.plan.jet(np.linspace(found.plan.start, found.plan.end, 200_001), 3)).max(axis=(1, 2))
+    assert jet[1] <= 20.0 * (1 + 1e-9)
+    assert jet[3] <= 100.0 * (1 + 1e-9)
+    for time, left, speed in ((found.plan.start, False, speeds[0]), (found.plan.end, True, speeds[1])):
+        assert np.linalg.norm(found.plan.jet(time, 1, left=left)[1]) == pytest.approx(speed, rel=1e-9, abs=1e-9)
+    free = fastest(plan, limits, hold="path").duration
+    assert free * (1 - 2e-3) <= found.duration <= free + 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "seed", "jerk"), [(3, 1, 10.0), (4, 2, 40.0), (5, 3, 100.0)])
+def test_given_speeds_on_a_path_are_those_of_a_nonlinear_program(count, seed, jerk):
+    """Limits of the jerk alone, b = 1 at both ends, and limits at the nodes of a fine grid, by IPOPT."""
+    casadi = pytest.importorskip("casadi")
+    points = np.random.default_rng(seed).normal(size=(2, count))
+    times = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points), axis=0)))
+    first = np.full((2, count), np.nan)
+    first[:, 0], first[:, -1] = points[:, 1] - points[:, 0], points[:, -1] - points[:, -2]
+    first /= np.linalg.norm(first, axis=0)
+    plan = PiecewiseSpline.from_arrays(times, points, derivatives={1: first}, warn=False)
+    cells = 1600
+    s = np.linspace(plan.start, plan.end, cells + 1)
+    h = s[1] - s[0]
+    b = casadi.MX.sym("b", cells + 1)
+    slope, bend = (b[2:] - b[:-2]) / (2 * h), (b[2:] - 2 * b[1:-1] + b[:-2]) / h**2
+    rows = [
+        casadi.sqrt(b[1:-1]) * (p3 * b[1:-1] + 1.5 * p2 * slope + 0.5 * p1 * bend)
+        for p1, p2, p3 in zip(*plan.jet(s[1:-1], 3)[1:], strict=True)
+    ]
+    time = 2 * h * casadi.sum1(1 / (casadi.sqrt(b[1:]) + casadi.sqrt(b[:-1])))
+    problem = {"x": b, "f": time, "g": casadi.vertcat(*rows)}
+    solver = casadi.nlpsol("solver", "ipopt", problem, {"ipopt.print_level": 0, "print_time": False})
+    low, high = np.full(cells + 1, 1e-4), np.full(cells + 1, np.inf)
+    low[[0, -1]] = high[[0, -1]] = 1.0
+    solved = solver(x0=1.0, lbx=low, ubx=high, lbg=-jerk, ubg=jerk)
+    assert solver.stats()["success"]
+    found = fastest(plan, {"jerk": jerk}, hold="path", ends="given")
+    assert 0.998 * float(solved["f"]) <= found.duration <= 1.01 * float(solved["f"])
+    check_limits(found.plan, {"jerk": jerk})
 
 
 @pytest.mark.slow

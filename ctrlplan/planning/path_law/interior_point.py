@@ -37,6 +37,9 @@ _MISSED = 1e-6
 _ROUNDING = 16.0 * float(np.finfo(float).eps)
 """Rounding of the sum of a row relative to its terms."""
 
+_BEND = 100.0
+"""Increase of the price of an excess by one of the size of the limit."""
+
 _STEP = 0.98
 """Step relative to the longest one within the inequalities."""
 
@@ -61,6 +64,9 @@ class Problem:
         Largest ratio of a coefficient to that of the start, and of its reciprocal.
     accuracy : float, optional
         Distance from the inequalities, relative to the limits, up to which they hold.
+    price : float, optional
+        Of the sum of the excesses over the limits of all rows [s]; inf, the default, where
+        they hold.
     """
 
     spline: Spline
@@ -71,10 +77,18 @@ class Problem:
     lower: Array
     trust: float = math.inf
     accuracy: float = 1e-9
+    price: float = math.inf
 
     def duration(self, x: Array) -> float:
         """Duration [s] with given coefficients."""
         return float((self.weights / np.sqrt(_applied(self.points, x[self.spline.index]))).sum())
+
+    def excess(self, x: Array) -> Array:
+        """Maximum violation of the limits in each cell (ncells,), below 0 inside of them."""
+        values = _applied(self.rows, x[self.spline.index])
+        beyond = np.concatenate([values - self.upper, self.lower - values[: len(self.lower)]])
+        largest: Array = beyond.max(axis=0)
+        return largest
 
     def feasible_scale(self, x: Array) -> float:
         """Largest factor of coefficients for which the inequalities hold."""
@@ -104,7 +118,8 @@ def minimum(problem: Problem, start: Array) -> Array:
         If no coefficients that satisfy the inequalities are found.
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # without a solution multipliers may overflow
-        return _Search(problem, start).minimum()
+        search = _Search if math.isinf(problem.price) else _SoftSearch
+        return search(problem, start).minimum()
 
 
 class _Search:
@@ -129,15 +144,13 @@ class _Search:
         first, second = self._pairs = np.triu_indices(size)
         ends = np.sort(np.stack([self._index[:, first], self._index[:, second]]), axis=0)
         self._place = (ends[1] - ends[0]) * self._size + ends[0]  # in the lower bands
+        self._free = np.where(spline.fixed, 0.0, 1.0)
+        self._active: Array = np.concatenate([np.ones(self._upper.size + self._lower.size), self._free, self._free])
 
     def minimum(self) -> Array:
         """Coefficients at the optimum."""
-        x = self._start
-        w = np.maximum(self._slacks(x), _NEAREST * self._sizes())
-        free = np.where(self._fixed, 0.0, 1.0)
-        active: Array = np.concatenate([np.ones(w.size - 2 * x.size), free, free])
-        # At the optimum the sum of the multipliers of normalised limits is half the duration.
-        y = active * 0.5 * self._duration(x) / (active / w).sum() / w
+        x, w, y = self._begun()
+        free, active = self._free, self._active
         step = np.ones(x.size)
         for _ in range(_ROUNDS):
             gradient, curvature = self._objective(x)
@@ -146,7 +159,7 @@ class _Search:
             # Without a duality gap the duration decreases at most by the residual times the remaining step.
             residual = free * step * (gradient - self._pulled(y))
             if gap < tolerance and np.abs(residual).sum() < tolerance and self._is_feasible(x, missed):
-                return self._scale * x
+                return self._scale * x[: self._size]
             try:
                 solve = self._solver(curvature, y / w)
             except LinAlgError:
@@ -166,7 +179,14 @@ class _Search:
             x, w, y = x + primal * dx, w + primal * dw, y + dual * dy
         if not self._is_feasible(x, missed):
             self._raise_infeasible()
-        return self._scale * x
+        return self._scale * x[: self._size]
+
+    def _begun(self) -> tuple[Array, Array, Array]:
+        """Coefficients, slacks and multipliers at the start."""
+        w = np.maximum(self._slacks(self._start), _NEAREST * self._sizes())
+        # At the optimum the sum of the multipliers of normalised limits is half the duration.
+        y = self._active * 0.5 * self._duration(self._start) / (self._active / w).sum() / w
+        return self._start, w, y
 
     def _is_feasible(self, x: Array, missed: Array) -> bool:
         """Whether all limits hold, up to the accuracy and rounding of the rows, whose terms may be far above them."""
@@ -248,6 +268,71 @@ class _Search:
             raise LinAlgError(f"minor {failed} must be positive")
         free = ~self._fixed
         return lambda right: free * dpbtrs(factor, free * right, lower=1)[0]
+
+
+class _SoftSearch(_Search):
+    """The same with limits of rows that may be exceeded: the excesses are unknowns that follow the coefficients.
+
+    The price p of an excess e is p e (1 + c e/2): without the second term excesses may remain large at a few places.
+    """
+
+    def __init__(self, problem: Problem, start: Array) -> None:
+        super().__init__(problem, start)
+        self._price, self._count = problem.price, self._upper.size + self._lower.size
+        ones = np.ones(self._count)
+        self._start = np.append(self._start, 0.0 * ones)
+        self._free, self._active = np.append(self._free, ones), np.append(self._active, ones)
+
+    def _begun(self) -> tuple[Array, Array, Array]:
+        x, w, y = super()._begun()
+        slack, products = self._slacks(x)[: self._count], w[0] * y[0]
+        # Excesses e for which the slacks, s + e and e, have the same products with their multipliers.
+        linear, root = self._price * slack - 2.0 * products, np.hypot(self._price * slack, 2.0 * products)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            excess = np.where(
+                linear > 0.0, 2.0 * products * slack / (linear + root), 0.5 * (root - linear) / self._price
+            )
+        w[: self._count] = slack + excess
+        y[: self._count] = products / w[: self._count]
+        x[self._size :] = w[-self._count :] = excess
+        y[-self._count :] = products / excess
+        return x, w, y
+
+    def _objective(self, x: Array) -> tuple[Array, Array]:
+        gradient, curvature = super()._objective(x)
+        return np.append(gradient, self._price * (1.0 + _BEND * x[self._size :])), curvature
+
+    def _slacks(self, x: Array) -> Array:
+        return self._with_excess(super()._slacks(x[: self._size]), x[self._size :])
+
+    def _changes(self, dx: Array) -> Array:
+        return self._with_excess(super()._changes(dx[: self._size]), dx[self._size :])
+
+    def _with_excess(self, slacks: Array, excess: Array) -> Array:
+        slacks[: self._count] += excess
+        return np.append(slacks, excess)
+
+    def _sizes(self) -> Array:
+        return np.append(super()._sizes(), np.ones(self._count))
+
+    def _pulled(self, values: Array) -> Array:
+        own = values[: -self._count]
+        return np.append(super()._pulled(own), own[: self._count] + values[-self._count :])
+
+    def _solver(self, curvature: Array, stiffness: Array) -> Callable[[Array], Array]:
+        of_rows, of_excess = stiffness[: self._count], stiffness[-self._count :] + _BEND * self._price
+        total, reduced = of_rows + of_excess, stiffness[: -self._count].copy()
+        reduced[: self._count] *= of_excess / total  # the excesses are eliminated
+        solve = super()._solver(curvature, reduced)
+
+        def solution(right: Array) -> Array:
+            own, others = right[: self._size], right[self._size :]
+            pulled = np.zeros(reduced.size)
+            pulled[: self._count] = of_rows / total * others
+            dx = solve(own - _Search._pulled(self, pulled))
+            return np.append(dx, (others - of_rows * _Search._changes(self, dx)[: self._count]) / total)
+
+        return solution
 
 
 def _applied(rows: Array, x: Array) -> Array:

@@ -9,6 +9,7 @@ durations decrease. The last one is a local minimum.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -19,8 +20,9 @@ from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.interior_point import Problem, minimum
 from ctrlplan.planning.path_law.law import changes, losses, problem_of
-from ctrlplan.planning.path_law.rows import SMOOTH_POINTS, Activity
+from ctrlplan.planning.path_law.rows import POINTS, SMOOTH_POINTS, Activity
 from ctrlplan.planning.path_law.spans import Part, Rates, parts_of
+from ctrlplan.planning.path_law.sweep import check_ends
 from ctrlplan.trajectories import PiecewisePolynomial, Retimed, Trajectory
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 
@@ -32,6 +34,10 @@ _LOSS, _REFINEMENTS, _PIECES = 5e-3, 2, 3
 
 _START = 0.8
 """Squared rate of the start relative to the largest constant one."""
+
+_DIVISIONS, _NEARLY, _FALLS = 2, 1e-5, 0.9
+"""Maximum number of divisions of the cells that exceed a limit with given speeds at the ends, the excess relative to
+the limit that is small, and the ratio of that of a round to that before below which it is still falling."""
 
 INSIDE = 0.95
 """Start of each problem relative to the last solution, which is at its limits."""
@@ -75,18 +81,38 @@ def fastest_smooth_law(
     edges = [time - start + plan.start for times in (*map(changes, bounds), narrow) for time in times]
     parts = parts_of(plan, True, edges, given, start)
     grid = Grid.of(plan, [part for part in parts if part.moves], smooth=True)
-    problems = _Problems(grid, Activity.of(grid, bounds, SMOOTH_POINTS, start), reserve)
-    x, duration = problems.start(), np.inf
+    problems, duration = _Problems(grid, bounds, start, reserve), np.inf
+    x = problems.start()
+    if problems.prescribed:
+        problems, x = _within_limits(problems, x)
     for refinement in range(_REFINEMENTS + 1):
         local, duration = problems.converged(x, duration)
-        loss = losses(problems.activity, local, grid.length)
+        loss = losses(problems.activity, local, problems.grid.length)
         if loss.sum() < _LOSS or refinement == _REFINEMENTS:
             break
-        counts = np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int)
-        local, grid = on_pieces(local, counts), grid.divided(counts)
-        problems = _Problems(grid, Activity.of(grid, bounds, SMOOTH_POINTS, start), reserve)
-        x = problems.near(local)
-    return Retimed(plan, smooth_law(plan, parts, grid, local))
+        problems, x = problems.divided(np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int), local)
+    return Retimed(plan, smooth_law(plan, parts, problems.grid, local))
+
+
+def _within_limits(problems: _Problems, x: Array) -> tuple[_Problems, Array]:
+    """Coefficients that satisfy the limits with given speeds at the ends, on cells divided where they would not.
+
+    Raises
+    ------
+    ValueError
+        If none are found.
+    """
+    for division in range(_DIVISIONS + 1):
+        x, excess = problems.nearest(x)
+        if excess.max() < _NEARLY:
+            return problems, x
+        if division < _DIVISIONS:
+            problems, x = problems.divided(np.where(excess > _NEARLY, _PIECES, 1), problems.local(x))
+    problems.check_ends()
+    raise ValueError(
+        "limits must be satisfied with the speeds at the ends of the plan and at corners, but no such time law is "
+        "found; lower these speeds, raise the limits, or choose free ends"
+    )
 
 
 class _Problems:
@@ -98,22 +124,52 @@ class _Problems:
         Cells, and the limited signals at their points.
     """
 
-    def __init__(self, grid: Grid, activity: Activity, reserve: float) -> None:
-        self.grid, self.activity = grid, activity
-        self._reserve, self._spline = reserve, Spline.quartic(grid)
+    def __init__(self, grid: Grid, bounds: Sequence[Bound], start: float, reserve: float) -> None:
+        self.grid, self.activity = grid, Activity.of(grid, bounds, SMOOTH_POINTS, start)
+        self._bounds, self._origin, self._reserve, self._spline = bounds, start, reserve, Spline.quartic(grid)
+
+    @property
+    def prescribed(self) -> bool:
+        """Whether rates at ends are prescribed."""
+        return bool(self._spline.fixed.any())
+
+    def divided(self, counts: NDArray[np.intp], local: Array) -> tuple[_Problems, Array]:
+        """Problems on the pieces of divided cells, and coefficients there near given Bernstein coefficients."""
+        problems = _Problems(self.grid.divided(counts), self._bounds, self._origin, self._reserve)
+        return problems, problems._with_prescribed(problems._spline.near(on_pieces(local, counts)))
 
     def start(self) -> Array:
-        """Coefficients of the first law."""
-        x = np.full(self._spline.size, _START * _constant(self.grid, self.activity))
-        x[self._spline.fixed] = self.grid.prescribed
-        if not self._spline.fixed.any():
-            return x
-        without = replace(self.activity, jerks=self.activity.jerks[:0])
-        return minimum(self._about(without, x), x)
+        """Coefficients of the first law: the largest constant one, that of the plan with prescribed rates."""
+        rate = 1.0 if self.prescribed else _START * _constant(self.grid, self.activity)
+        return self._with_prescribed(np.full(self._spline.size, rate))
 
-    def near(self, local: Array) -> Array:
-        """Coefficients near given Bernstein coefficients."""
-        x = self._spline.near(local)
+    def check_ends(self) -> None:
+        """Raise for prescribed rates that limits of velocities and accelerations do not allow."""
+        bounds = [bound for bound in self._bounds if bound.order < 3]
+        if bounds:
+            rows = Activity.of(self.grid, bounds, POINTS, self._origin).rows(self.grid.length)
+            check_ends(self.grid, rows.with_reserve(POINTS.size, 0.0, *self.grid.ends(moving=True)).relaxed())
+
+    def local(self, x: Array) -> Array:
+        """Bernstein coefficients (degree + 1, ncells)."""
+        return self._spline.coefficients(x)
+
+    def nearest(self, x: Array) -> tuple[Array, Array]:
+        """Coefficients with small excesses over the limits, and the largest one in each cell (ncells,)."""
+        best, least = x, np.full(self.grid.length.size, np.inf)
+        for _ in range(_ROUNDS):
+            shares = np.maximum(self.activity.jerk_shares(self.local(x), self.grid.length), 1.0)
+            problem = self._about(x, shares)
+            excess = problem.excess(x)
+            if not excess.max() < _FALLS * least.max():
+                break
+            best, least = x, excess
+            if excess.max() < _NEARLY:
+                break
+            x = minimum(replace(problem, price=problem.duration(x)), x)
+        return best, least
+
+    def _with_prescribed(self, x: Array) -> Array:
         x[self._spline.fixed] = self.grid.prescribed
         return x
 
@@ -123,16 +179,23 @@ class _Problems:
         The decreases of the duration vanish faster than their power 3/2.
         """
         for _ in range(_ROUNDS):
-            problem = self._about(self.activity, x)
-            x = minimum(problem, np.where(self._spline.fixed, x, INSIDE * x))
+            problem = self._about(x)
+            x = self._minimum(problem, x)
             duration = problem.duration(x)
             gain, last = 1.0 - duration / last, duration
             if abs(gain) < _GAIN ** (2.0 / 3.0):
                 break
-        return self._spline.coefficients(x), last
+        return self.local(x), last
 
-    def _about(self, activity: Activity, x: Array) -> Problem:
-        rows = activity.rows(self.grid.length, self._spline.coefficients(x))
+    def _minimum(self, problem: Problem, x: Array) -> Array:
+        if not self.prescribed:
+            return minimum(problem, INSIDE * x)
+        with suppress(ValueError):
+            return minimum(problem, x)
+        return minimum(replace(problem, price=problem.duration(x)), x)  # where limits leave almost no freedom
+
+    def _about(self, x: Array, shares: Array | None = None) -> Problem:
+        rows = self.activity.rows(self.grid.length, self.local(x), shares)
         ends = self.grid.ends(moving=True)
         return problem_of(self.grid, self._spline, rows.with_reserve(SMOOTH_POINTS.size, self._reserve, *ends))
 

@@ -130,7 +130,7 @@ class Activity:
         own: Array = np.linalg.inv(bernstein(self.points, self.points.size - 1))  # type: ignore[assignment]
         return own
 
-    def rows(self, length: Array, former: Array | None = None) -> Rows:
+    def rows(self, length: Array, former: Array | None = None, shares: Array | None = None) -> Rows:
         """Inequalities for the control points of all signals in each cell.
 
         Parameters
@@ -140,6 +140,9 @@ class Activity:
         former : ndarray, shape (degree + 1, ncells), optional
             Bernstein coefficients about which limits of the jerk are linear; default:
             none, for a quadratic squared rate.
+        shares : ndarray, shape (nlimits, npoints, ncells), optional
+            Jerks of that squared rate relative to their limits, 1 where they are lower;
+            default: 1.
         """
         degree = 2 if former is None else len(former) - 1
         values, slopes = bernstein(self.points, degree), bernstein(self.points, degree, 1)
@@ -151,14 +154,16 @@ class Activity:
         upper = np.concatenate([1.0 + shift, np.ones(self.speeds.shape)])
         blocks = [factors.reshape(shape), speeds]
         if former is not None:
-            blocks.insert(1, self._jerk_rows(length, former).reshape(shape))
-            upper = np.concatenate([upper, np.ones((len(blocks[1]), length.size))])
+            jerks, limits = self._jerk_rows(length, former, shares)
+            blocks.insert(1, jerks.reshape(shape))
+            upper = np.concatenate([1.0 + shift, limits.reshape(-1, length.size), upper[len(shift) :]])
         return Rows(np.concatenate(blocks), upper, shift - 1.0)
 
-    def _jerk_rows(self, length: Array, former: Array) -> Array:
+    def _jerk_rows(self, length: Array, former: Array, shares: Array | None) -> tuple[Array, Array]:
         """Rows (nlimits, npoints, ncells, degree + 1) of the jerk: R <= 1/sqrt(b), whose right side is convex.
 
-        Its tangent at the former squared rate b_0 is 3/(2 sqrt(b_0)) - b/(2 sqrt(b_0)^3).
+        Its tangent at the former squared rate b_0 is 3/(2 sqrt(b_0)) - b/(2 sqrt(b_0)^3). Where the jerk is c times its
+        limit there, R sqrt(b) <= 1 is linear instead: R sqrt(b_0) + c (b/b_0 - 1)/2 <= 1.
         """
         degree = len(former) - 1
         values, slopes, bends = (bernstein(self.points, degree, nu) for nu in range(3))
@@ -167,7 +172,10 @@ class Activity:
         h = length[None, None, :, None]
         values, slopes, bends = (own[None, :, None] for own in (values, slopes, bends))
         signal = third * values + 1.5 * second * slopes / h + 0.5 * first * bends / h**2
-        return np.einsum("ab,kbcm->kacm", self._control, signal * np.sqrt(b) / 1.5 + values / (3.0 * b))
+        bent, limits = values / (3.0 * b), np.ones(self.jerks[:, 0].shape)
+        if shares is not None:
+            bent, limits = bent * shares[..., None], np.einsum("ab,kbc->kac", self._control, (2.0 + shares) / 3.0)
+        return np.einsum("ab,kbcm->kacm", self._control, signal * np.sqrt(b) / 1.5 + bent), limits
 
     def worst(self, local: Array, length: Array) -> Array:
         """Signals relative to their limits (npoints, ncells), by Bernstein coefficients (degree + 1, ncells)."""
@@ -178,10 +186,15 @@ class Activity:
             value = tangent * 0.5 * slope + curvature * b
             for side in (1.0 + centre, centre - 1.0):
                 found = np.maximum(found, np.divide(value, side, out=np.zeros_like(value), where=side != 0.0))
-        bend = bernstein(points, degree, 2) @ local / length**2
-        for first, second, third in self.jerks:
-            found = np.maximum(found, (third * b + 1.5 * second * slope + 0.5 * first * bend) * np.sqrt(b))
-        return found
+        return np.maximum(found, self.jerk_shares(local, length).max(axis=0, initial=0.0))
+
+    def jerk_shares(self, local: Array, length: Array) -> Array:
+        """Jerks relative to their limits (nlimits, npoints, ncells)."""
+        degree, points = len(local) - 1, self.points
+        b, slope, bend = (bernstein(points, degree, nu) @ local / length**nu for nu in range(3))
+        first, second, third = self.jerks.swapaxes(0, 1)
+        shares: Array = (third * b + 1.5 * second * slope + 0.5 * first * bend) * np.sqrt(b)
+        return shares
 
 
 def _strictest(rows: Array, two_sided: bool) -> Array:

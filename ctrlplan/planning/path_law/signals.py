@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 
 from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid, Spline
-from ctrlplan.planning.path_law.interior_point import minimum
+from ctrlplan.planning.path_law.interior_point import Problem, minimum
 from ctrlplan.planning.path_law.jerk import on_pieces, smooth_law
 from ctrlplan.planning.path_law.law import problem_of
 from ctrlplan.planning.path_law.rows import Rows
@@ -277,7 +277,7 @@ class _Problems:
             try:
                 rows = self._signals.rows(self._spline.coefficients(x), reserves)
                 problem = replace(problem_of(self._grid, self._spline, rows), trust=trust, accuracy=_ACCURACY)
-                tried = minimum(problem, x)
+                tried = self._minimum(problem, x)
             except ValueError:  # the linearised limits cannot be satisfied near this solution
                 x, trust = best, trust**0.4 if solved else 4.0 * trust
                 if not 1.001 < trust < _FARTHEST:
@@ -299,6 +299,18 @@ class _Problems:
                 min(trust**2, _WIDEST) if gain > 0.75 * promised else trust if gain > 0.25 * promised else trust**0.5
             )
         return _Solution(best, duration)
+
+    def _minimum(self, problem: Problem, x: Array) -> Array:
+        """Solution of a linearised problem.
+
+        With given ends and a start that violates the limits, one with small excesses if there is none.
+        """
+        try:
+            return minimum(problem, x)
+        except ValueError:
+            if not (self._grid.prescribed.any() and self._signals.beyond(self._spline.coefficients(x)) > 0.0):
+                raise
+        return minimum(replace(problem, price=problem.duration(x)), x)
 
 
 class _Signals:

@@ -7,7 +7,7 @@ import numpy as np
 from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.interior_point import UNBOUNDED
 from ctrlplan.planning.path_law.rows import Rows
-from ctrlplan.planning.path_law.spans import Rates
+from ctrlplan.planning.path_law.spans import Part, Rates
 from ctrlplan.trajectories.common import Array
 
 _ROUNDS = 4
@@ -30,8 +30,7 @@ def swept(grid: Grid, spline: Spline, rows: Rows) -> Array:
         If the rate is not limited.
     """
     cells, x = _Cells(rows, grid.joints[0] ** 2), np.empty(spline.size)
-    firsts = np.flatnonzero(np.diff(grid.part, prepend=-1)).tolist()
-    for part, begin, end in zip(grid.parts, firsts, [*firsts[1:], grid.part.size], strict=True):
+    for part, begin, end in _cells_of_parts(grid):
         starts = cells.closed(begin, end) if part.closed else cells.open(begin, end, part.rates)
         if not starts.max() < 1e-3 * _FAR:
             raise ValueError(UNBOUNDED)
@@ -40,6 +39,20 @@ def swept(grid: Grid, spline: Spline, rows: Rows) -> Array:
             x[index[0, 0]], x[index[2, -1]] = starts[0], ends[-1]
         x[index[1]] = 0.5 * (starts[:-1] + ends)
     return x
+
+
+def check_ends(grid: Grid, rows: Rows) -> None:
+    """Raise for prescribed rates that are infeasible, with the largest feasible ones."""
+    cells = _Cells(rows, grid.joints[0] ** 2)
+    for part, begin, end in _cells_of_parts(grid):
+        if not part.closed:
+            cells.open(begin, end, part.rates)
+
+
+def _cells_of_parts(grid: Grid) -> list[tuple[Part, int, int]]:
+    """Parts, the first cell of each, and the one after its last."""
+    firsts = np.flatnonzero(np.diff(grid.part, prepend=-1)).tolist()
+    return list(zip(grid.parts, firsts, [*firsts[1:], grid.part.size], strict=True))
 
 
 class _Cells:
