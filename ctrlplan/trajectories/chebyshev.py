@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ctrlplan.trajectories.common import Array, readonly
 
+_SMALL = 1e-3  # last coefficient, relative to the largest, by which a series is not divided
 DEGREES = (16, 32, 64, 128)
 """Degrees of interpolants that are tried, in turn."""
 
@@ -62,24 +63,60 @@ def real_roots(coefficients: Array) -> Array:
 
 
 def roots_of_rows(coefficients: Array) -> tuple[NDArray[np.intp], Array]:
-    """Rows and roots in [-1, 1] of Chebyshev series (nrows, size), including double roots split by rounding."""
+    """Rows and roots in [-1, 1] of Chebyshev series (nrows, size), including double roots split by rounding.
+
+    The last coefficients may be rounding: they change the roots by as much as the
+    same change of any other coefficient.
+    """
     size = np.abs(coefficients)
-    matters = size > 1e-15 * size.max(axis=1, keepdims=True)
+    largest = size.max(axis=1, keepdims=True)
+    matters = size > 1e-15 * largest
     degree = np.where(matters.any(axis=1), size.shape[1] - 1 - matters[:, ::-1].argmax(axis=1), 0)
     rows, roots = [np.empty(0, dtype=np.intp)], [np.empty(0)]
     for n in sorted(set(degree.tolist()) - {0}):
         own = (degree == n).nonzero()[0]
-        # Eigenvalues of the colleague matrices, whose last columns differ.
-        matrices = np.empty((own.size, n, n))
-        matrices[:] = _colleague(n)
-        matrices[:, :, -1] -= _weights(n) * coefficients[own, :n] / coefficients[own, n, None]
-        found = np.linalg.eigvals(matrices)
-        near = np.abs(found.real) < 1.0 + 1e-6
-        if found.dtype.kind == "c":
-            near &= np.abs(found.imag) < 1e-3
-        rows.append(own[near.nonzero()[0]])
-        roots.append(np.clip(found.real[near], -1.0, 1.0))
+        is_small = size[own, n] < _SMALL * largest[own, 0]
+        for chosen, eigenvalues in ((own[~is_small], _eigenvalues), (own[is_small], _shifted_eigenvalues)):
+            if chosen.size:
+                found = eigenvalues(coefficients[chosen, : n + 1] / largest[chosen])
+                near = np.abs(found.real) < 1.0 + 1e-6
+                if found.dtype.kind == "c":
+                    near &= np.abs(found.imag) < 1e-3
+                rows.append(chosen[near.nonzero()[0]])
+                roots.append(np.clip(found.real[near], -1.0, 1.0))
     return np.concatenate(rows), np.concatenate(roots)
+
+
+def _eigenvalues(series: Array) -> Array:
+    """Roots (nrows, degree) of series: eigenvalues of the colleague matrices, whose last columns differ."""
+    n = series.shape[1] - 1
+    matrices = np.empty((len(series), n, n))
+    matrices[:] = _colleague(n)
+    matrices[:, :, -1] -= _weights(n) * series[:, :n] / series[:, n, None]
+    return np.asarray(np.linalg.eigvals(matrices))
+
+
+def _shifted_eigenvalues(series: Array) -> Array:
+    """Roots (nrows, degree) of series whose last coefficient is small.
+
+    The colleague matrix divides by the last coefficient, and its eigenvalues lose as
+    many digits. The generalised problem A v = x B v does not divide. Shifted by a
+    point s of [-1, 1] where the series is large and inverted, (A - s B)^-1 B has the
+    eigenvalues 1/(x - s): roots in the interval are its large, accurate eigenvalues.
+    """
+    n = series.shape[1] - 1
+    places, basis = _extreme_points(n)
+    shifts = places[np.abs(series @ basis).argmax(axis=1)]
+    right = np.zeros((len(series), n, n))
+    right[:] = np.eye(n)
+    right[:, -1, -1] = series[:, n]
+    left = _colleague(n) @ right
+    left[:, :, -1] -= _weights(n) * series[:, :n]
+    left -= shifts[:, None, None] * right
+    inverse = np.linalg.eigvals(np.linalg.solve(left, right))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        found = shifts[:, None] + 1.0 / inverse
+    return np.asarray(np.where(np.abs(inverse) > 0.1, found, np.inf))  # roots in the interval are above 0.5
 
 
 def points(degree: int, a: float, b: float) -> Array:
@@ -110,6 +147,14 @@ def _colleague(degree: int) -> Array:
 def _weights(degree: int) -> Array:
     """Weights of the coefficients in the last column of a colleague matrix."""
     return readonly(0.5 * np.where(np.arange(degree) > 0, 1.0, np.sqrt(2.0)) if degree > 1 else np.ones(1))
+
+
+@lru_cache(maxsize=64)
+def _extreme_points(degree: int) -> tuple[Array, Array]:
+    """Extreme points (degree + 1,) of the Chebyshev polynomial of a degree, and the polynomials up to it there."""
+    quarters = np.outer(np.arange(degree + 1), np.arange(degree + 1)) % (2 * degree)
+    basis = np.cos((np.pi / degree) * quarters)
+    return readonly(basis[1].copy()), readonly(basis)
 
 
 @lru_cache(maxsize=64)

@@ -571,7 +571,7 @@ def _evaluate_series(table: Array, centres: Array, t: Array, cell: int, is_even:
     basis[0] = 1.0
     flat = out.reshape(-1, t.size)  # a view
     times = t[: whole * cell].reshape(whole, cell)
-    values = flat[:, : whole * cell].reshape(-1, whole, cell).transpose(1, 0, 2)
+    values = flat[:, : whole * cell].reshape(len(flat), whole, cell).transpose(1, 0, 2)
     if whole < len(table):
         _evaluate_cells(table[whole:], centres[whole:], t[None, whole * cell :], basis, flat[None, :, whole * cell :])
     if is_even and whole:
