@@ -106,17 +106,15 @@ def _shifted_eigenvalues(series: Array) -> Array:
     """
     n = series.shape[1] - 1
     places, basis = _extreme_points(n)
-    shifts = places[np.abs(series @ basis).argmax(axis=1)]
-    right = np.zeros((len(series), n, n))
-    right[:] = np.eye(n)
-    right[:, -1, -1] = series[:, n]
-    left = _colleague(n) @ right
+    shifts = places[np.abs(series @ basis).argmax(axis=1), None]
+    left = _colleague(n) - shifts[:, :, None] * np.eye(n)
+    left[:, :, -1] *= series[:, n, None]
     left[:, :, -1] -= _weights(n) * series[:, :n]
-    left -= shifts[:, None, None] * right
-    inverse = np.linalg.eigvals(np.linalg.solve(left, right))
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        found = shifts[:, None] + 1.0 / inverse
-    return np.asarray(np.where(np.abs(inverse) > 0.1, found, np.inf))  # roots in the interval are above 0.5
+    inverse = np.linalg.inv(left)
+    inverse[:, :, -1] *= series[:, n, None]
+    found = np.linalg.eigvals(inverse)
+    found[np.abs(found) < 0.1] = 0.1  # those of roots in the interval are at least 0.5
+    return np.asarray(shifts + 1.0 / found)
 
 
 def points(degree: int, a: float, b: float) -> Array:
