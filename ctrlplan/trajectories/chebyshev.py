@@ -99,8 +99,8 @@ def _eigenvalues(series: Array) -> Array:
 def _shifted_eigenvalues(series: Array) -> Array:
     """Roots (nrows, degree) of series whose last coefficient is small.
 
-    The colleague matrix divides by the last coefficient, and its eigenvalues lose as
-    many digits. The generalised problem A v = x B v does not divide. Shifted by a
+    The colleague matrix divides by the last coefficient, which amplifies the rounding
+    of its eigenvalues. The generalised problem A v = x B v does not divide. Shifted by a
     point s of [-1, 1] where the series is large and inverted, (A - s B)^-1 B has the
     eigenvalues 1/(x - s): roots in the interval are its large, accurate eigenvalues.
     """

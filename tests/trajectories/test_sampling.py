@@ -460,3 +460,15 @@ def test_a_piecewise_spline_at_many_times_and_at_each(count, alpha):
             for i in rng.choice(count, 12):
                 exact = plan.jet(float(t[i]), 3, left)
                 assert (np.abs(found[:, :, i] - exact) <= 1e-12 * peaks[:4]).all(), (name, left, t[i])
+
+
+@pytest.mark.parametrize("count", [1, 31, 255, 256, 300, 777, 1023, 1024, 1025, 2047])
+def test_fewer_times_than_a_cell_in_a_short_segment(count):
+    cubic = PolySpline(waypoints([0.0, 2.0, 4.0], [[0.0], [1.0], [0.0]]))
+    other = PiecewiseSpline(waypoints([0.0, 3.997, 5.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    plan = stack([cubic, other], labels=["a", "b"])
+    t = np.linspace(3.997, 4.0, count, endpoint=False)
+    for order in range(3):
+        found = plan(t, order)
+        exact = np.array([plan(x, order) for x in t.tolist()]).T
+        assert np.abs(found - exact).max() <= 1e-13 * plan.peak(order).max()
