@@ -225,8 +225,9 @@ class Sweep(Displayed):
         """
         from ctrlplan.reports import write_page
 
-        if len(self.failures) == self.values.size:
-            why = "in which every value failed; see .failures" if self.failures else "interrupted before any value"
+        if not self.metrics or len(self.failures) == self.values.size:
+            early = self.interrupted and not self.failures
+            why = "interrupted before any value" if early else "in which every value failed; see .failures"
             raise ValueError(f"a report must have metrics, got a sweep {why}")
         return write_page([self], path, title or f"Sweep over {self.parameter}")
 
