@@ -70,7 +70,8 @@ class Avoidance(Displayed):
     def _describe(self) -> Iterator[Part]:
         yield f"{title_of(self.plan)}, clearance at least {self.clearance.lower:.6g}"
         yield Facts(self.clearance.facts())
-        yield waypoint_table(self.plan.waypoints, self.plan.labels)
+        if self.plan.waypoints:
+            yield waypoint_table(self.plan.waypoints, self.plan.labels)
         yield Figure("Position and velocity of the plan over time.", 2, lambda axes: self.plan.plot(ax=axes))
 
     def _as_plan(self) -> Trajectory:

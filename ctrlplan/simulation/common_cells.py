@@ -56,9 +56,9 @@ class CommonCells:
         marks = np.append(marks - run.first, [float(offset) for _, offset in form.base.timings])
         for halving in range(_HALVINGS):
             cell = float(common / 2**halving)
-            count = math.floor((run.span + run.tolerance) / cell) + 1
-            if count > PARTS:
+            if not run.span + run.tolerance < cell * PARTS:
                 return
+            count = math.floor((run.span + run.tolerance) / cell) + 1
             found = cls(cell, _edges_of(marks, cell, run.tolerance), count)
             if found.count > PARTS:
                 return

@@ -110,9 +110,11 @@ def _resolving(run: DelayedRun, key: tuple[object, ...], marks: Array, limit: in
     # What is sampled at the end of the run is seen in a cell after it.
     edges = np.append(marks, marks[-1] + 1e-3 * min(longest, run.span))
     for _ in range(_HALVINGS):
-        counts = np.ceil(np.diff(edges) / longest * (1.0 - 1e-12)).astype(int)
-        if counts.sum() > limit:
+        with np.errstate(over="ignore"):
+            wanted = np.ceil(np.diff(edges) / longest * (1.0 - 1e-12))
+        if not wanted.sum() <= limit:  # before they are integers, which overflow
             return None
+        counts = wanted.astype(int)
         cells = run.form.cells.get((key, longest), partial(HopCells, run.form, edges, counts, longest, run.tolerance))
         values = run.values(cells.starts[:, None] + cells.lengths[:, None] * points(NODES - 1, 0.0, 1.0))
         if is_resolved(values, run.noise(float(cells.lengths.max()))):

@@ -1,4 +1,4 @@
-"""Signals of a sampled or nonlinear loop along a plan, by simulation over the move and a tail."""
+"""Signals of a sampled, delayed or nonlinear loop along a plan, by simulation over the move and a tail."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _PERIODS = (2, 4, 8, 16, 32, 64)
 
 
 class SimulatedQuantities(LoopSignals):
-    """Signals of a sampled or nonlinear loop along a plan, by simulation.
+    """Signals of a sampled, delayed or nonlinear loop along a plan.
 
     Parameters
     ----------

@@ -99,6 +99,24 @@ class Clipped(Trajectory):
         ends = [known if abs(known - time) <= near else time for known, time in zip(nearest, times, strict=True)]
         return type(self)(moved, *ends)
 
+    @property
+    def deviation(self) -> Array:
+        """Maximum deviation from signals that the plan interpolates."""
+        found = getattr(self.plan, "deviation", None)
+        if found is None:
+            raise AttributeError(
+                f"a part of a {type(self.plan).__name__}, which interpolates no signals, has no deviation"
+            )
+        return np.asarray(found)
+
+    def _facts(self) -> list[tuple[str, str]]:
+        errors = getattr(self.plan, "deviation", [0.0] * self.naxes)
+        known = [(f"deviation of {name}", f"{e:.3g}") for name, e in zip(self.labels, errors, strict=True) if e]
+        return [*super()._facts(), *known]
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [*super()._facts(), *(fact for fact in self.plan._facts() if fact[0].startswith("deviation of "))]
+
     def _has_quick_peaks(self) -> bool:
         return super()._has_quick_peaks() and self.plan._has_quick_peaks()
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_finite, checked_names, default_labels, real_array
+from ctrlplan._checks import MAXIMUM, checked_finite, checked_names, default_labels, real_array
 from ctrlplan._display import time_text
 from ctrlplan.trajectories.clipped import Clipped
 from ctrlplan.trajectories.combined import stack
@@ -33,6 +33,9 @@ _RESOLVED = 1e-6
 
 _ROUNDING = 1e-12
 """Deviation relative to the largest of all signals that is attributed to rounding."""
+
+_CONDITION = 3.0**6
+"""Maximum sum of the magnitudes of all terms of a polynomial, relative to its Bernstein coefficients."""
 
 _MAXIMUM_SAMPLES = 513
 """Maximum number of samples in a segment."""
@@ -82,7 +85,8 @@ def as_trajectory(
         A PiecewisePolynomial for splines of scipy, B-splines of python-control and
         interpolated signals; a PolySpline or a TrigSpline for flat outputs in
         polynomials or in a `TrigFamily`, stacked if their numbers of functions differ;
-        `Clipped` for a part of them.
+        `Clipped` for a part of them. Each interval of a B-spline or a BPoly of a degree
+        above 6 is divided into several segments, in which powers lose no digits.
 
     Raises
     ------
@@ -168,13 +172,15 @@ def _of_spline(obj: Any, names: list[str] | None) -> Trajectory:
     if isinstance(obj, BSpline):
         knots = real_array(obj.t, "knots")
         real_array(obj.c, "coefficients")
-        times = np.unique(knots[obj.k : len(obj.c) + 1])
-        powers = np.arange(obj.k, -1, -1)
-        table = np.stack([obj(times[:-1], nu=k) / FACTORIALS[k] for k in powers.tolist()])
-        table = np.moveaxis(table, 1 + obj.axis, 1)
-    elif isinstance(obj, PPoly | BPoly):
-        poly = obj if isinstance(obj, PPoly) else PPoly.from_bernstein_basis(obj)
-        times, table = real_array(poly.x, "breakpoints"), real_array(poly.c, "coefficients")
+        times = _divided(np.unique(knots[obj.k : len(obj.c) + 1]), obj.k)
+        table = np.moveaxis(_taylor(obj, times, obj.k), 1 + obj.axis, 1)
+    elif isinstance(obj, BPoly):
+        real_array(obj.c, "coefficients")
+        degree = len(obj.c) - 1
+        times = _divided(real_array(obj.x, "breakpoints"), degree)
+        table = np.moveaxis(_taylor(obj, times, degree), 1 + obj.axis, 1)
+    elif isinstance(obj, PPoly):
+        times, table = real_array(obj.x, "breakpoints"), real_array(obj.c, "coefficients")
         lasting = np.diff(times) != 0.0  # PPoly.from_spline repeats knots
         times, table = np.append(times[:-1][lasting], times[-1]), table[:, lasting]
     else:
@@ -186,6 +192,27 @@ def _of_spline(obj: Any, names: list[str] | None) -> Trajectory:
     if table.ndim > 3:
         raise ValueError(f"values of the spline must be numbers or vectors, got shape {table.shape[2:]}")
     return PiecewisePolynomial(times, table.reshape(*table.shape[:2], -1), labels=names)
+
+
+def _divided(times: Array, degree: int) -> Array:
+    """Times between which powers of a degree are conditioned as those of degree 6 are, with further ones if required.
+
+    The sum of the magnitudes of all terms of a polynomial, in powers of the time since the start of a part, is up to
+    (1 + 2 / parts)^degree times its Bernstein coefficients over the whole interval.
+    """
+    if degree > MAXIMUM:
+        raise ValueError(f"degree of the spline must be at most {MAXIMUM}, got {degree}")
+    parts = 1
+    while (1.0 + 2.0 / parts) ** degree > _CONDITION:
+        parts += 1
+    inner = times[:-1, None] + np.diff(times)[:, None] * (np.arange(parts) / parts)
+    times = np.append(inner, times[-1])
+    return times[np.append(True, np.diff(times) != 0.0)]
+
+
+def _taylor(spline: Any, times: Array, degree: int) -> Array:
+    """Taylor coefficients (degree + 1, nsegments, ...) of a spline of scipy at the start of each segment."""
+    return np.stack([spline(times[:-1], nu=k) / FACTORIALS[k] for k in range(degree, -1, -1)])
 
 
 # Plans of control.flatsys
@@ -204,7 +231,16 @@ def _of_flat(obj: Any, start: float | None, end: float | None, names: list[str] 
     rows = _rows_of(names, known, "states and inputs")
     breaks = np.asarray(getattr(basis, "breakpoints", whole), dtype=float)
     inner = breaks[(breaks > first) & (breaks < last)]
-    return _interpolated(lambda t: np.vstack(obj.eval(t)), rows, np.array([first, *inner, last]), names)
+
+    def evaluate(t: Array) -> Array:
+        try:
+            return np.vstack(obj.eval(t))
+        except ValueError as error:  # of scipy, for splines that are not as smooth as states and inputs require
+            raise ValueError(
+                f"states and inputs must be defined by the plan, got from python-control: {error}; use the flat outputs"
+            ) from error
+
+    return _interpolated(evaluate, rows, np.array([first, *inner, last]), names)
 
 
 def _interval(basis: Any, start: float | None, end: float | None) -> tuple[float, float]:
@@ -264,13 +300,18 @@ def _terms(obj: Any, axis: int, k: int, t: Array) -> Array:
 
 def _of_b_splines(obj: Any, axes: list[int], names: list[str]) -> PiecewisePolynomial:
     """Flat outputs in B-splines, by their derivatives at the start of each segment."""
+    from scipy.interpolate import BSpline
+
     basis = obj.basis
-    times = np.asarray(basis.breakpoints, dtype=float)
-    highest = [basis.degree[axis if basis.nvars else 0] for axis in axes]
-    table = np.zeros((max(highest) + 1, times.size - 1, len(axes)))
-    for column, (axis, degree) in enumerate(zip(axes, highest, strict=True)):
-        for k in range(degree + 1):
-            table[-1 - k, :, column] = _terms(obj, axis, k, times[:-1]).sum(axis=0) / FACTORIALS[k]
+    own = [axis if basis.nvars else 0 for axis in axes]
+    highest = max(basis.degree[i] for i in own)
+    times = _divided(np.asarray(basis.breakpoints, dtype=float), highest)
+    table = np.zeros((highest + 1, times.size - 1, len(axes)))
+    for column, (axis, i) in enumerate(zip(axes, own, strict=True)):
+        degree, coefficients = basis.degree[i], real_array(obj.coeffs[axis], "coefficients")
+        # Not by eval_deriv, which raises where internal knots repeat.
+        spline = BSpline(basis.knotpoints[i], coefficients, degree)
+        table[highest - degree :, :, column] = _taylor(spline, times, degree)
     return PiecewisePolynomial(times, table, labels=names)
 
 

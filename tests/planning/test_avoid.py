@@ -453,6 +453,22 @@ def test_a_spline_of_a_users_own_is_led_round():
 # The result, and its use as a plan, which works for one release
 
 
+PLANS_WITHOUT_WAYPOINTS = {
+    "profile": lambda: cp.SCurve([1.0, 2.0], velocity=8.0, acceleration=200.0, jerk=1e4),
+    "fit": lambda: cp.fit([0.0, 1.0, 2.0, 3.0], [[0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 1.0, 0.0]]),
+    "stacked": lambda: cp.stack([cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1)])] * 2, labels=["x", "z"]),
+}
+
+
+@pytest.mark.parametrize("kind", PLANS_WITHOUT_WAYPOINTS)
+def test_a_result_of_a_plan_without_waypoints_is_displayed(kind):
+    found = avoid(PLANS_WITHOUT_WAYPOINTS[kind](), [Disc((20.0, 3.0), 1.0)], clearance=0.1)
+    assert found.plan.waypoints == ()
+    for text in (str(found), found._repr_html_()):
+        assert f"clearance at least {found.clearance.lower:.6g}" in text
+        assert "waypoint" not in text.split("<svg")[0]
+
+
 def test_a_result_has_the_plan_and_its_clearance():
     plan, disc = cp.PolySpline(ACROSS), [Disc((10.0, 5.2), 2.0)]
     found = avoid(plan, disc, clearance=0.5)

@@ -76,6 +76,16 @@ def test_a_delay_of_no_length_next_to_the_run():
     assert np.abs(found.outputs - PLAN.shift(1e-9)(T)).max() <= 1e-15
 
 
+@pytest.mark.parametrize("delay", [1e-15, 1e-20, 1e-300, 5e-324])
+def test_a_delay_of_no_length_in_a_loop(delay):
+    late = cp.create_delay_iosystem(delay, inputs="u", outputs="late")
+    lag = ct.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]], inputs="late", outputs="y")
+    gain = ct.ss([], [], [], [[2.0, -2.0]], inputs=["r", "y"], outputs="u")
+    loop = ct.interconnect([late, lag, gain], inputs="r", outputs="y")
+    with pytest.raises(ValueError, match=rf"a delay must be at least 1e-05 of the run of 5 s, got {delay:g} s"):
+        cp.simulate(loop, T, PLAN)
+
+
 def test_axes_are_joined_to_inputs_by_name():
     system = ct.ss([], [], [], np.eye(2), inputs=["z", "x"], outputs=["a", "b"])
     plan = cp.stack([PLAN, 2.0 * PLAN], labels=["x", "z"])

@@ -1,6 +1,7 @@
 """Trajectories from splines of scipy and from plans of python-control, against the objects themselves."""
 
 import pickle
+from fractions import Fraction
 from types import SimpleNamespace
 
 import control as ct
@@ -45,6 +46,49 @@ def test_spline_has_the_values_and_derivatives_of_scipy(name):
         wanted = wanted if wanted.ndim == 1 or "last" in name else wanted.T
         np.testing.assert_allclose(plan(t, nu), wanted, rtol=0, atol=1e-12 * max(1.0, np.abs(wanted).max()))
     assert not plan.deviation.any()
+
+
+def _exact(knots, coefficients, degree, time):
+    """Value of a B-spline by de Boor's algorithm in rational numbers."""
+    t, x = [Fraction(float(knot)) for knot in knots], Fraction(float(time))
+    last = max(j for j in range(degree, len(coefficients)) if t[j] <= x and t[j] < t[j + 1])
+    d = [Fraction(float(c)) for c in coefficients[last - degree : last + 1]]
+    for r in range(1, degree + 1):
+        for j in range(degree, r - 1, -1):
+            left, right = t[j + last - degree], t[j + 1 + last - r]
+            share = (x - left) / (right - left)
+            d[j] = (1 - share) * d[j - 1] + share * d[j]
+    return d[degree]
+
+
+@pytest.mark.parametrize("degree", [5, 6, 7, 13, 25])
+@pytest.mark.parametrize("inner", [[0.4, 1.1, 2.9], [1e-3, 1.5, 1.5 + 1e-6], [1.0, 1.0, 1.0, 2.0]])
+def test_splines_of_high_degree_lose_no_digits(degree, inner):
+    """Powers over a whole interval would lose three to the power of the degree: 6e-5 of degree 25."""
+    knots = np.array([0.0] * (degree + 1) + inner + [3.0] * (degree + 1))
+    coefficients = np.random.default_rng(degree).uniform(-1.0, 1.0, knots.size - degree - 1)
+    plan = cp.as_trajectory(si.BSpline(knots, coefficients, degree))
+    t = np.sort(np.append(np.random.default_rng(1).uniform(0.0, 3.0, 25), plan.breakpoints[:-1]))
+    wanted = [float(_exact(knots, coefficients, degree, time)) for time in t]
+    np.testing.assert_allclose(plan(t), wanted, rtol=0, atol=3e-14)
+    assert set(knots) <= set(plan.breakpoints)
+
+
+@pytest.mark.parametrize("degree", [5, 13, 25])
+def test_bernstein_polynomials_of_high_degree_lose_no_digits(degree):
+    times = [0.0, 0.3, 2.0]
+    coefficients = np.random.default_rng(degree).uniform(-1.0, 1.0, (degree + 1, 2))
+    plan = cp.as_trajectory(si.BPoly(coefficients, times))
+    for segment, time in ((0, 0.29), (0, 0.1), (1, 0.3), (1, 1.7), (1, 1.99)):
+        knots = [times[segment]] * (degree + 1) + [times[segment + 1]] * (degree + 1)
+        wanted = float(_exact(knots, coefficients[:, segment], degree, time))
+        assert abs(plan(time) - wanted) <= 3e-14
+
+
+def test_degree_of_a_spline_is_limited():
+    for spline in (si.BPoly(np.ones((102, 1)), [0.0, 1.0]), si.BSpline([0.0] * 102 + [1.0] * 102, np.ones(102), 101)):
+        with pytest.raises(ValueError, match="degree of the spline must be at most 100, got 101"):
+            cp.as_trajectory(spline)
 
 
 CONTINUITY = {
@@ -195,6 +239,28 @@ def car():
     return fs.FlatSystem(forward, reverse, states=["x", "y", "theta"], inputs=["v", "delta"], outputs=2)
 
 
+@pytest.mark.parametrize(("degree", "smoothness"), [(5, 4), (5, 3), (5, 2), (3, 0), (13, 9)])
+def test_flat_outputs_in_b_splines_of_any_smoothness(degree, smoothness):
+    """python-control cannot derive them `degree` times where knots repeat."""
+    system = ct.ss([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], 0)
+    breaks = [0.0, 0.3, 2.0]
+    basis = fs.BSplineFamily(breaks, degree, smoothness)
+    coefficients = np.random.default_rng(1).normal(size=basis.var_ncoefs(0))
+    plan = cp.as_trajectory(fs.SystemTrajectory(fs.LinearFlatSystem(system), basis, [coefficients], [3]))
+    t = np.linspace(0.0, 1.99, 101)
+    terms = [c * basis.eval_deriv(j, 0, t) for j, c in enumerate(coefficients)]
+    np.testing.assert_allclose(plan(t), np.sum(terms, axis=0), rtol=0, atol=3e-14)
+    assert set(breaks) <= set(plan.breakpoints)
+
+
+def test_states_that_python_control_cannot_evaluate():
+    system = ct.ss([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], 0)
+    basis = fs.BSplineFamily([0.0, 0.3, 2.0], 3, 0)
+    plan = fs.SystemTrajectory(fs.LinearFlatSystem(system), basis, [np.ones(7)], [3])
+    with pytest.raises(ValueError, match=r"must be defined by the plan, got .*; use the flat outputs"):
+        cp.as_trajectory(plan, signals="x[0]")
+
+
 @pytest.fixture(scope="module")
 def lane_change():
     basis = fs.BSplineFamily([0, 5, 10], [5, 6], vars=2)
@@ -265,6 +331,19 @@ def test_error_between_samples_is_below_the_deviation(count):
     assert (error <= plan.deviation).all()
     assert (plan.deviation < 100 * error).all()
     assert [jump for jump in plan.jumps(2) if plan.start < jump.time < plan.end] == []
+
+
+def test_a_part_states_the_deviation_of_the_whole():
+    found = result()
+    whole, part = cp.as_trajectory(found), cp.as_trajectory(found, 0.5, 1.0)
+    assert part.duration == 0.5
+    assert whole.deviation.any()
+    assert part.deviation.tolist() == whole.deviation.tolist()
+    assert cp.trajectory_from_dict(part.to_dict()).deviation.tolist() == whole.deviation.tolist()
+    assert part.shift(1.0).deviation.tolist() == whole.deviation.tolist()
+    assert f"deviation of {whole.labels[0]}" in str(part)
+    with pytest.raises(AttributeError, match="a part of a SCurve, which interpolates no signals, has no deviation"):
+        _ = cp.as_trajectory(cp.SCurve(1.0, velocity=1.0, acceleration=1.0, jerk=1.0), 0.5, 1.0).deviation
 
 
 def test_inputs_are_linear_between_samples():
