@@ -114,9 +114,6 @@ class Clipped(Trajectory):
         known = [(f"deviation of {name}", f"{e:.3g}") for name, e in zip(self.labels, errors, strict=True) if e]
         return [*super()._facts(), *known]
 
-    def _facts(self) -> list[tuple[str, str]]:
-        return [*super()._facts(), *(fact for fact in self.plan._facts() if fact[0].startswith("deviation of "))]
-
     def _has_quick_peaks(self) -> bool:
         return super()._has_quick_peaks() and self.plan._has_quick_peaks()
 

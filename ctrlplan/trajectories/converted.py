@@ -86,7 +86,7 @@ def as_trajectory(
         interpolated signals; a PolySpline or a TrigSpline for flat outputs in
         polynomials or in a `TrigFamily`, stacked if their numbers of functions differ;
         `Clipped` for a part of them. Each interval of a B-spline or a BPoly of a degree
-        above 6 is divided into several segments, in which powers lose no digits.
+        above 6 is divided into several segments, in which powers keep their digits.
 
     Raises
     ------
