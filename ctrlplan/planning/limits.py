@@ -211,10 +211,10 @@ def margins(
         angle of a car) are nan there and rejected; along a `PathPlan` they are
         determined.
     tail : float, optional
-        Time after the plan [s] for which a loop is simulated that is nonlinear, has a
-        delay, or is sampled without an exact response (see `loop_quantities`);
-        default: the duration of the plan. Signals of other loops are exact, at all
-        times.
+        Time after the plan [s] for which a loop is simulated that is nonlinear,
+        continuous with a delay, or sampled without an exact response (see
+        `loop_quantities`); default: the duration of the plan. Signals of other loops
+        are exact, at all times.
     params : mapping of str to float or (float, float), optional
         Values, or ranges (minimum, maximum), of parameters of `system`, which must
         then be a plant that has them by name (`Crane`), or a function that takes
