@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import os
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -220,8 +221,11 @@ def _checked_folder(folder: Path) -> None:
     existing = folder
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
-    if not existing.is_dir() or not os.access(existing, os.W_OK):
-        raise ValueError(f"--out must be a writable folder, got {folder}")
+    try:  # not os.access, which knows neither full disks nor folders of the system
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise ValueError(f"--out must be a writable folder, got {folder}: {error.strerror or error}") from None
 
 
 def _print_status(text: str) -> None:

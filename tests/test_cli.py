@@ -410,6 +410,20 @@ def test_where_every_plan_fails_nothing_is_written(failing, tmp_path, capsys):
 # Written whole or not at all
 
 
+def test_a_folder_that_cannot_be_written_is_rejected_before_a_study_runs(study, tmp_path, monkeypatch, capsys):
+    def full(**given):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", full)
+    for words in (["reproduce"], ["online"], ["report", str(study)]):
+        assert main([*words, "--out", str(tmp_path / "new")]) == 2
+        errors = capsys.readouterr().err.splitlines()
+        assert errors[-1].startswith("ctrlplan: --out must be a writable folder, got ")
+        assert errors[-1].endswith(": No space left on device")
+        assert not any("running" in line for line in errors)
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.slow
 def test_without_room_for_the_page_nothing_is_left(study, tmp_path):
     resource = pytest.importorskip("resource", reason="there are no limits of the size of files here")

@@ -212,6 +212,7 @@ class _Equations:
         self.discrete, self._trials = prepared.is_discrete, trials
         self.unknown: tuple[str, ...] = ()
         self.fixed = np.zeros(prepared.nstates, dtype=bool)
+        self.delays: Callable[[Array], str] = lambda x: ""
         self.delay_mismatch: Callable[[Array], str] = lambda x: ""
         self._rates: Vector
         self._outputs: Vector
@@ -265,6 +266,14 @@ class _Equations:
                 moved[place] = equations.sampled((i,), time, x, held)[place] - x[place]
             return moved
 
+        def delays(x: Array) -> str:
+            signals = equations.signals(time, x, held)
+            found = [
+                f"{network.blocks[i].name} at initial = {_listed(signals[network.outputs[i]])}"
+                for i in network.blocks_with("delay")
+            ]
+            return ", ".join(found)
+
         def delay_mismatch(x: Array) -> str:
             signals = equations.signals(time, x, held)
             for i in network.blocks_with("delay"):
@@ -279,7 +288,8 @@ class _Equations:
             found = [network.fed[i](signals) - signals[network.outputs[i]] for i in network.blocks_with("delay")]
             return np.concatenate([np.zeros(0), *found])
 
-        self._rates, self.delay_mismatch, self._gaps = rates, delay_mismatch, gaps
+        self._rates, self._gaps = rates, gaps
+        self.delays, self.delay_mismatch = delays, delay_mismatch
         self._outputs = lambda x: network.to_outputs(equations.signals(time, x, held))
 
     def rates(self, x: Array) -> Array:
@@ -346,13 +356,18 @@ def _found(
         if distance <= _RESIDUAL * size:
             break
     if nearest is None:
-        return start, _of_samples(equations) if equations.unknown else equations.delay_mismatch(
-            start
-        ) or "none was found by iteration"
+        return start, _of_samples(equations) if equations.unknown else _not_found(equations, start)
     state = whole(nearest[1])
     if equations.unknown and nearest[0] > _RESIDUAL * size:
         return state, _of_samples(equations)
     return state, equations.delay_mismatch(state)
+
+
+def _not_found(equations: _Equations, start: Array) -> str:
+    why = "none was found by iteration"
+    if delays := equations.delays(start):
+        why += f" with the outputs of delays that start as declared ({delays}): give their values at rest there"
+    return equations.delay_mismatch(start) or why
 
 
 def _of_samples(equations: _Equations) -> str:

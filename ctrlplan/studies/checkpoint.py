@@ -61,10 +61,13 @@ class Checkpoint:
         Raises
         ------
         ValueError
-            If the folder has the checkpoint of another study.
+            If the path is an empty text, or the folder has the checkpoint of another
+            study.
         OSError
             If it is a file, or the folder cannot be made or written to.
         """
+        if folder == "":  # as of a variable that is not set; Path("") is the current folder
+            raise ValueError('checkpoint must be a folder, got an empty text; give "." for the current folder')
         path = Path(folder)
         if path.exists() and not path.is_dir():
             raise FileExistsError(f"checkpoint must be a folder, got {path}, which is a file; give another path")

@@ -258,3 +258,12 @@ def test_an_interruption_on_a_full_disk_returns_what_is_finished(tmp_path, monke
     ):
         found = swept(Counted(bent, at=2.0), tmp_path)
     assert found.values.tolist() == RATES[:3]
+
+
+def test_an_empty_text_is_no_folder(tmp_path, monkeypatch):
+    """As of a variable of a job's script that is not set."""
+    monkeypatch.chdir(tmp_path)
+    for run in (swept, drawn):
+        with pytest.raises(ValueError, match="checkpoint must be a folder, got an empty text"):
+            run(lag, "")
+    assert not list(tmp_path.iterdir())

@@ -137,6 +137,21 @@ def test_a_delay_that_holds_what_goes_in_at_rest():
         compared(build(0.0))
 
 
+@pytest.mark.parametrize("dt", [0, 0.1])
+def test_a_delay_whose_output_must_be_given_is_named(dt):
+    """The controller has no direct feedthrough: at the zero state nothing differs from the output of the delay."""
+    plant = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="late", outputs="y", name="plant")
+    integral = pi(0.0, 0.5) if dt == 0 else cp.sample_hold(pi(0.0, 0.5, dt=dt), dt)
+
+    def build(initial):
+        late = cp.create_delay_iosystem(0.2, inputs="q", outputs="late", initial=initial, name="pipe")
+        return lambda name, p: joined(p, integral, late, plant)
+
+    assert rests(compared(build(10.0)), 10.0, 1e-8)
+    with pytest.warns(UserWarning, match=r"delays that start as declared \(pipe at initial = 0\): give their values"):
+        compared(build(0.0))
+
+
 # Loops that are not linear
 
 
