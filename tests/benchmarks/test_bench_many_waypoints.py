@@ -10,7 +10,7 @@ from time import process_time
 import control as ct
 import numpy as np
 import pytest
-from scipy.interpolate import BPoly, PPoly, make_interp_spline, splrep
+from scipy.interpolate import BPoly, PPoly, make_interp_spline, make_lsq_spline, splrep
 
 import ctrlplan as cp
 from ctrlplan.trajectories.waypoint import Entries
@@ -222,6 +222,28 @@ def test_fit_beside_splrep(option, benchmark, capsys):
         times.append(seconds((ours, peer), max(1, 1000 // n)))
     benchmark.pedantic(ours, rounds=3)
     report(capsys, benchmark, f"fit({option}=) next to splrep of the same deviation", times, sizes)
+
+
+@pytest.mark.benchmark
+def test_fit_near_the_noise_beside_least_squares(benchmark, capsys):
+    """Noise of the tolerance. Peer: make_lsq_spline on the knots that our plan has. Goal: at most 2."""
+    times, sizes = [], (1000, 5000, 20_000)
+    for n in sizes:
+        t = np.linspace(0.0, 10.0, n)
+        y = np.sin(t) + np.random.default_rng(1).normal(scale=1e-3, size=n)
+
+        def ours(t=t, y=y):
+            return cp.fit(t, y, tolerance=1e-3)
+
+        knots = np.concatenate([[t[0]] * 3, ours().breakpoints, [t[-1]] * 3])
+
+        def peer(t=t, y=y, knots=knots):
+            return make_lsq_spline(t, y, knots, k=3)
+
+        np.testing.assert_allclose(ours()(t), peer()(t), rtol=0, atol=1e-12)
+        times.append(seconds((ours, peer), 1))
+    benchmark.pedantic(ours, rounds=1)
+    report(capsys, benchmark, "fit near the noise next to make_lsq_spline of the same knots", times, sizes)
 
 
 @pytest.mark.benchmark

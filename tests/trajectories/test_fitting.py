@@ -219,3 +219,19 @@ def test_bad_input(name):
     with pytest.raises(kind) as caught:
         call()
     assert re.search(message, str(caught.value)), str(caught.value)
+
+
+@pytest.mark.parametrize("spacing", ["even", "uneven"])
+def test_a_tolerance_near_the_noise_takes_many_knots_of_least_squares(spacing):
+    """The spline is that of scipy on the same knots, which are fewer than samples."""
+    rng = np.random.default_rng(5)
+    t = np.linspace(0.0, 10.0, 3000) if spacing == "even" else np.sort(rng.uniform(0.0, 10.0, 3000))
+    y = np.sin(t) + 1e-3 * rng.normal(size=t.size)
+    plan = cp.fit(t, y, tolerance=2e-3, continuity=2)
+    assert 200 < plan.breakpoints.size < 2000
+    assert plan.deviation[0] <= 2e-3
+    assert np.abs(plan(t) - y).max() == pytest.approx(plan.deviation[0], rel=1e-9)
+    degree = 3
+    knots = np.concatenate([[plan.start] * degree, plan.breakpoints, [plan.end] * degree])
+    peer = si.make_lsq_spline(t, y, knots, k=degree)
+    np.testing.assert_allclose(plan(t), peer(t), rtol=0, atol=1e-12)
