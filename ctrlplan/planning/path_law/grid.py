@@ -183,7 +183,7 @@ class Spline:
     @classmethod
     def quartic(cls, grid: Grid) -> Spline:
         """Spline with three continuous derivatives in each part, by the coefficients of B-splines."""
-        index, extraction = np.empty((5, grid.length.size), dtype=np.intp), np.empty((5, 5, grid.length.size))
+        index, knots = np.empty((5, grid.length.size), dtype=np.intp), np.empty((8, grid.length.size))
         size, bandwidth, fixed = 0, 4, []
         firsts = np.flatnonzero(np.diff(grid.part, prepend=-1)).tolist()
         for part, begin, end in zip(grid.parts, firsts, [*firsts[1:], grid.length.size], strict=True):
@@ -191,8 +191,8 @@ class Spline:
             steps = grid.length[own]
             beyond = np.resize(steps, 4) if part.closed else np.zeros(4)
             before = np.resize(steps[::-1], 4)[::-1] if part.closed else np.zeros(4)
-            knots = np.cumsum(np.concatenate([[0.0], before, steps, beyond])) - before.sum()
-            extraction[:, :, own] = _extraction(knots, 4)
+            of_part = np.cumsum(np.concatenate([[0.0], before, steps, beyond])) - before.sum()
+            knots[:, own] = of_part[1 + cells + np.arange(8)[:, None]]
             index[:, own] = cells + np.arange(5)[:, None]
             if part.closed:
                 index[:, own], bandwidth = _interleaved(count)[(index[:, own] - 2) % count], 8
@@ -200,7 +200,7 @@ class Spline:
             size += count if part.closed else count + 4
             prescribed = [rate is not None for rate in part.rates]
             fixed += [False] * count if part.closed else [prescribed[0], *[False] * (count + 2), prescribed[1]]
-        return cls(index, extraction, size, bandwidth, np.array(fixed))
+        return cls(index, _extraction(knots), size, bandwidth, np.array(fixed))
 
     @classmethod
     def of(cls, grid: Grid) -> Spline:
@@ -245,17 +245,23 @@ class Spline:
         return np.einsum("rcb,bmc->mrc", local, self.bernstein)
 
 
-def _extraction(knots: Array, degree: int) -> Array:
-    """Bernstein coefficients (degree + 1, degree + 1, ncells) of the B-splines on each cell, in this order of axes."""
-    cells = np.arange(degree, knots.size - degree - 1)
+def _extraction(knots: Array) -> Array:
+    """Bernstein coefficients (degree + 1, degree + 1, ncells) of the B-splines on each cell, in this order of axes.
+
+    Parameters
+    ----------
+    knots : ndarray, shape (2 degree, ncells)
+        Those of the B-splines on a cell; the two in the middle are its ends.
+    """
+    degree = len(knots) // 2
     points = np.linspace(0.0, 1.0, degree + 1)
-    x = knots[cells] + points[:, None] * (knots[cells + 1] - knots[cells])
-    values = np.zeros((degree + 1, degree + 1, cells.size))  # by B-spline and point
+    x = knots[degree - 1] + points[:, None] * (knots[degree] - knots[degree - 1])
+    values = np.zeros((degree + 1, *x.shape))  # by B-spline and point
     values[0] = 1.0
-    for order in range(1, degree + 1):  # the recursion of Cox and de Boor, of all cells together
+    for order in range(1, degree + 1):  # the recursion of Cox and de Boor
         carried = np.zeros_like(x)
         for k in range(order):
-            left, right = knots[cells + k + 1 - order], knots[cells + k + 1]
+            left, right = knots[degree + k - order], knots[degree + k]
             share = values[k] / (right - left)
             values[k] = carried + (right - x) * share
             carried = (x - left) * share

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import numpy as np
@@ -89,6 +89,20 @@ class Problem:
         beyond = np.concatenate([values - self.upper, self.lower - values[: len(self.lower)]])
         largest: Array = beyond.max(axis=0)
         return largest
+
+    def near_limits(self, x: Array, share: float) -> Problem:
+        """Problem without the rows below a share of their limits with given coefficients, with as many in each cell."""
+        values, two = _applied(self.rows, x[self.spline.index]), len(self.lower)
+        beyond = values - share * self.upper
+        beyond[:two] = np.maximum(beyond[:two], share * self.lower - values[:two])
+        counts = [int((own > 0.0).sum(axis=0).max(initial=0)) for own in (beyond[:two], beyond[two:])]
+        both, single = (
+            np.argsort(-own, axis=0)[:count] for own, count in zip((beyond[:two], beyond[two:]), counts, strict=True)
+        )
+        index = np.concatenate([both, single + two])
+        rows = np.take_along_axis(self.rows, index[None], axis=1)
+        upper, lower = np.take_along_axis(self.upper, index, axis=0), np.take_along_axis(self.lower, both, axis=0)
+        return replace(self, rows=rows, upper=upper, lower=lower)
 
     def feasible_scale(self, x: Array) -> float:
         """Largest factor of coefficients for which the inequalities hold."""

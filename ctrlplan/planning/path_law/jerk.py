@@ -39,6 +39,9 @@ _DIVISIONS, _NEARLY, _FALLS = 2, 1e-5, 0.9
 """Maximum number of divisions of the cells that exceed a limit with given speeds at the ends, the excess relative to
 the limit that is small, and the ratio of that of a round to that before below which it is still falling."""
 
+_FAR = 0.5
+"""Share of its limit below which a signal of the last law hardly limits the next one."""
+
 INSIDE = 0.95
 """Start of each problem relative to the last solution, which is at its limits."""
 
@@ -180,19 +183,25 @@ class _Problems:
         """
         for _ in range(_ROUNDS):
             problem = self._about(x)
-            x = self._minimum(problem, x)
+            x = self._minimum(problem, x, np.isfinite(last))
             duration = problem.duration(x)
             gain, last = 1.0 - duration / last, duration
             if abs(gain) < _GAIN ** (2.0 / 3.0):
                 break
         return self.local(x), last
 
-    def _minimum(self, problem: Problem, x: Array) -> Array:
-        if not self.prescribed:
-            return minimum(problem, INSIDE * x)
-        with suppress(ValueError):
-            return minimum(problem, x)
-        return minimum(replace(problem, price=problem.duration(x)), x)  # where limits leave almost no freedom
+    def _minimum(self, problem: Problem, x: Array, optimal: bool) -> Array:
+        """Coefficients at the optimum, from those of a law, which may be the optimum of a similar problem."""
+        if self.prescribed:
+            with suppress(ValueError):
+                return minimum(problem, x)
+            return minimum(replace(problem, price=problem.duration(x)), x)  # where limits leave almost no freedom
+        if optimal:
+            with suppress(ValueError):  # without the other limits there may be no minimum
+                found = minimum(problem.near_limits(x, _FAR), INSIDE * x)
+                if problem.excess(found).max() <= problem.accuracy:
+                    return found
+        return minimum(problem, INSIDE * x)
 
     def _about(self, x: Array, shares: Array | None = None) -> Problem:
         rows = self.activity.rows(self.grid.length, self.local(x), shares)
