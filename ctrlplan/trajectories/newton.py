@@ -684,8 +684,10 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
         As of the pattern.
     """
     # Products of arrays of one shape take half the time of those that are spread over a further axis.
-    order, own, apart = pattern.order, pattern.own, pattern.apart
-    angle = times - times.take(pattern.waypoints)[:, None]  # of each function and waypoint
+    order, own = pattern.order, pattern.own
+    pairs = times.take(pattern.between)
+    angle = pairs[0]  # of each function and waypoint
+    angle -= pairs[1]
     if half:
         angle *= half
         sine, cosine = np.sin(angle), np.cos(angle)
@@ -693,44 +695,40 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
         factors += own
         ratio = cosine - own
         ratio /= factors
-        odd, bends = _odd_functions(pattern, half)
-        sine *= odd
-        cosine[::2] = 1.0
     else:
         factors = angle
         factors += own
-        ratio = apart / factors
-    sums = np.zeros((max(order, 1) + 1, *own.shape))  # e_k, then V e_k
-    value, rows = sums[0], list(sums)
-    value[0] = 1.0
+        ratio = pattern.apart / factors
+    sums = pattern.first_sums.copy()  # e_k, then V e_k
+    value, *rows = sums[: order + 1]
     np.multiply.accumulate(factors[:-1], 0, None, value[1:])
-    ratio = ratio[:-1]
-    terms = ratio
-    for k in range(1, order + 1):
-        np.add.accumulate(terms, 0, None, rows[k][1:])
+    terms = ratio = ratio[:-1]
+    for k, row in enumerate(rows, 1):
+        np.add.accumulate(terms, 0, None, row[1:])
         if k < order:
-            terms = ratio * rows[k][:-1]
+            terms = ratio * row[:-1]
     if half:
-        turned = _with_cosine(rows[: order + 1], sine, cosine, bends)
-        for row, one in zip(rows[1:], turned, strict=False):
-            np.multiply(one, value, row)
+        odd, bends = _odd_functions(pattern, half)
+        sine *= odd
+        cosine[::2] = 1.0
+        _multiply_by_cosine(rows, sine, cosine, bends)
+    for row in rows:
+        row *= value
+    if half:
         value *= cosine
-    else:
-        for row in rows[1:]:
-            row *= value
     return sums.take(places).T
 
 
-def _with_cosine(rows: Sequence[Array], sine: Array, cosine: Array, bends: Sequence[Array]) -> list[Array]:
+def _multiply_by_cosine(rows: Sequence[Array], sine: Array, cosine: Array, bends: Sequence[Array]) -> None:
     """Sums e_1, e_2, ... with one more factor c(h) cosine - S(h) sine, reduced by powers of cosines."""
-    found = [cosine]
-    for k in range(1, len(rows)):
-        row = cosine * rows[k]
-        row -= sine * rows[k - 1] if k > 1 else sine
-        if k > 1:
-            row -= bends[k - 2] * found[k - 2]
-        found.append(row)
-    return found[1:]
+    less = sine
+    for k, row in enumerate(rows):
+        following = sine * row if k + 1 < len(rows) else sine
+        row *= cosine
+        row -= less
+        if k:
+            row -= bends[k - 1] * (rows[k - 2] if k > 1 else cosine)
+        less = following
 
 
 @lru_cache(maxsize=256)
@@ -963,6 +961,20 @@ class Pattern:
     def own(self) -> Array:
         """1 for the node of a constraint (rows) at the waypoint itself, else 0, (nconstraints, nwaypoints)."""
         return readonly((self.waypoints[:, None] == np.arange(self.nwaypoints)).astype(float))
+
+    @cached_property
+    def between(self) -> NDArray[np.intp]:
+        """Waypoints, and those of the nodes of constraints (rows), (2, nconstraints, nwaypoints)."""
+        found = np.array(np.broadcast_arrays(np.arange(self.nwaypoints), self.waypoints[:, None]))
+        found.flags.writeable = False
+        return found
+
+    @cached_property
+    def first_sums(self) -> Array:
+        """Sums of `_products_at_nodes` without factors, (max(order, 1) + 1, nconstraints, nwaypoints)."""
+        found = np.zeros((max(self.order, 1) + 1, *self.own.shape))
+        found[0, 0] = 1.0
+        return readonly(found)
 
     @cached_property
     def apart(self) -> Array:
