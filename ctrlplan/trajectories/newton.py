@@ -220,9 +220,9 @@ class NewtonSystem(Fields):
             return np.asarray(table[pattern.waypoints, pattern.orders])
         return table.reshape(-1, naxes).take(pattern.rows, axis=0)
 
-    def taylor_scale(self, duration: float) -> Array:
-        """Factors from prescribed derivatives to normalised Taylor data, as a column."""
-        return _taylor_scale(duration, self.pattern)
+    def taylor_scale(self, duration: float, naxes: int = 1) -> Array:
+        """Factors (nconstraints, naxes) from prescribed derivatives to normalised Taylor data."""
+        return _taylor_scale(duration, self.pattern, naxes)
 
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
@@ -770,8 +770,8 @@ def shared_system(
 
 
 @lru_cache(maxsize=256)
-def _taylor_scale(duration: float, pattern: Pattern) -> Array:
-    """Powers of a duration over factorials by constraint, as a column."""
+def _taylor_scale(duration: float, pattern: Pattern, naxes: int) -> Array:
+    """Powers of a duration over factorials by constraint, repeated for each axis: products of one shape are faster."""
     order = pattern.order
     try:
         powers = [duration**k / math.factorial(k) for k in range(order + 1)]
@@ -782,7 +782,7 @@ def _taylor_scale(duration: float, pattern: Pattern) -> Array:
             f"powers of the duration must stay within floating point, got {duration:g} s to the power "
             f"{order}; choose another unit of time"
         )
-    return readonly(np.array(powers).take(pattern.orders)[:, None])
+    return readonly(np.array(powers).take(pattern.orders)[:, None].repeat(naxes, axis=1))
 
 
 @lru_cache(maxsize=256)
