@@ -48,7 +48,7 @@ from scipy.linalg import blas, lapack
 from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
-from ctrlplan.trajectories.fields import Fields
+from ctrlplan.trajectories.fields import Fields, stored_property
 from ctrlplan.trajectories.one_time import (
     effective,
     kernel_weights,
@@ -618,7 +618,7 @@ class NewtonSystem(Fields):
         scaled, inverse = self._scaled
         return float((np.abs(inverse) @ np.abs(scaled)).max())
 
-    @cached_property
+    @stored_property
     def _is_mild(self) -> bool:
         """Whether the amplification is below `_SUSPECT`.
 

@@ -153,7 +153,7 @@ class NewtonSpline(WaypointSpline):
         systems: dict[Kind, NewtonSystem] = {}
         parts, near = [], options.warn
         for kind, axes in _groups(patterns, options.gamma, table, alpha).items():
-            system = lent.get(kind) or _system(alpha, relative, apart, kind, options)
+            system = (lent and lent.get(kind)) or _system(alpha, relative, apart, kind, options)
             systems[kind] = system
             data = system.entries(table)
             if len(axes) < table.shape[2]:
