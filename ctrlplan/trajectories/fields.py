@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property, lru_cache
 from inspect import get_annotations
 from typing import Any, Self, TypeVar
@@ -59,7 +58,7 @@ class Fields(Frozen):
 T = TypeVar("T")
 
 
-class stored_property(cached_property[T]):
+class StoredProperty(cached_property[T]):
     """Cached property without a lock, which costs more than a short computation up to Python 3.11.
 
     For immutable values: two threads may compute the same one twice.

@@ -48,7 +48,7 @@ from scipy.linalg import blas, lapack
 from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
-from ctrlplan.trajectories.fields import Fields, stored_property
+from ctrlplan.trajectories.fields import Fields, StoredProperty
 from ctrlplan.trajectories.one_time import (
     effective,
     kernel_weights,
@@ -81,6 +81,9 @@ MAXIMUM_LOSS = 1e-6
 
 _MAXIMUM_DIGITS = 100
 """Maximum number of constraints for decimal arithmetic, which then takes a fraction of a second."""
+
+_INCREASING = 1.5
+"""Half of alpha [rad] up to which distances on the circle increase with those in time, by more than rounding."""
 
 _STORED = 64
 """Number of constraints up to which their order is stored for other times."""
@@ -618,7 +621,7 @@ class NewtonSystem(Fields):
         scaled, inverse = self._scaled
         return float((np.abs(inverse) @ np.abs(scaled)).max())
 
-    @stored_property
+    @StoredProperty
     def _is_mild(self) -> bool:
         """Whether the amplification is below `_SUSPECT`.
 
@@ -1061,24 +1064,34 @@ def _leja(
     """
     used = None if all(given) else [i for i, own in enumerate(given) if own]
     u = times if used is None else [times[i] for i in used]
-    half, last, sin = 0.5 * alpha, len(u) - 1, math.sin
-    product = [abs(sin(half * (w - u[0]))) for w in u] if half else [w - u[0] for w in u]
+    half, count, sin = 0.5 * alpha, len(u), math.sin
+    if count < 3:
+        return tuple(range(count) if used is None else used), False
+    first, end, chosen, rest = u[0], u[-1], [0], list(range(1, count))
+    whole = abs(sin(half * (end - first))) if half else end - first
     if meet:
-        nearest = min([abs(sin(half * (w - v))) if half else w - v for v, w in pairwise(u)], default=0.0)
-        meet = last > 1 and product[-1] < _MEET * nearest
-    chosen = [0]
-    while len(chosen) < last:
-        farthest = last if meet and len(chosen) == 1 else product.index(max(product))
+        meet = whole < _MEET * min([abs(sin(half * (w - v))) if half else w - v for v, w in pairwise(u)])
+    if meet or half <= _INCREASING:  # the end is second
+        chosen.append(rest.pop())
+        scale = whole or 1.0
+        if half:
+            product = [abs(sin(half * (u[i] - first))) * (abs(sin(half * (u[i] - end))) / scale) for i in rest]
+        else:
+            product = [(u[i] - first) * ((end - u[i]) / scale) for i in rest]
+    else:
+        product = [abs(sin(half * (w - first))) for w in u[1:]]
+    while len(rest) > 1:
+        place = product.index(max(product))
+        # Rescaled, so that the products do not underflow for many waypoints.
+        scale, farthest = product.pop(place) or 1.0, rest.pop(place)
         chosen.append(farthest)
-        if len(chosen) < last:
-            # Rescaled, so that the products do not underflow for many waypoints.
-            scale, v = product[farthest] or 1.0, u[farthest]
+        if len(rest) > 1:
+            v = u[farthest]
             if half:
-                product = [p * (abs(sin(half * (w - v))) / scale) for p, w in zip(product, u, strict=True)]
+                product = [p * (abs(sin(half * (u[i] - v))) / scale) for p, i in zip(product, rest, strict=True)]
             else:
-                product = [p * (abs(w - v) / scale) for p, w in zip(product, u, strict=True)]
-    if last:
-        chosen.append(last * (last + 1) // 2 - sum(chosen))  # the only one that is left
+                product = [p * (abs(u[i] - v) / scale) for p, i in zip(product, rest, strict=True)]
+    chosen += rest
     return tuple(chosen if used is None else [used[i] for i in chosen]), meet
 
 
