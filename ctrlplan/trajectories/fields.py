@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from inspect import get_annotations
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -53,6 +53,22 @@ class Fields(Frozen):
         found = type(self).__new__(type(self))
         found._set_fields(**(fields | values))
         return found
+
+
+T = TypeVar("T")
+
+
+class StoredProperty(cached_property[T]):
+    """Cached property without a lock, which costs more than a short computation up to Python 3.11.
+
+    For immutable values: two threads may compute the same one twice.
+    """
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        value = instance.__dict__[self.attrname] = self.func(instance)
+        return value
 
 
 @lru_cache(maxsize=1024)

@@ -48,7 +48,7 @@ from scipy.linalg import blas, lapack
 from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
-from ctrlplan.trajectories.fields import Fields
+from ctrlplan.trajectories.fields import Fields, StoredProperty
 from ctrlplan.trajectories.one_time import (
     effective,
     kernel_weights,
@@ -81,6 +81,9 @@ MAXIMUM_LOSS = 1e-6
 
 _MAXIMUM_DIGITS = 100
 """Maximum number of constraints for decimal arithmetic, which then takes a fraction of a second."""
+
+_INCREASING = 1.5
+"""Half of alpha [rad] up to which distances on the circle increase with those in time, by more than rounding."""
 
 _STORED = 64
 """Number of constraints up to which their order is stored for other times."""
@@ -220,9 +223,9 @@ class NewtonSystem(Fields):
             return np.asarray(table[pattern.waypoints, pattern.orders])
         return table.reshape(-1, naxes).take(pattern.rows, axis=0)
 
-    def taylor_scale(self, duration: float) -> Array:
-        """Factors from prescribed derivatives to normalised Taylor data, as a column."""
-        return _taylor_scale(duration, self.pattern)
+    def taylor_scale(self, duration: float, naxes: int = 1) -> Array:
+        """Factors (nconstraints, naxes) from prescribed derivatives to normalised Taylor data."""
+        return _taylor_scale(duration, self.pattern, naxes)
 
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
@@ -618,7 +621,7 @@ class NewtonSystem(Fields):
         scaled, inverse = self._scaled
         return float((np.abs(inverse) @ np.abs(scaled)).max())
 
-    @cached_property
+    @StoredProperty
     def _is_mild(self) -> bool:
         """Whether the amplification is below `_SUSPECT`.
 
@@ -684,8 +687,10 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
         As of the pattern.
     """
     # Products of arrays of one shape take half the time of those that are spread over a further axis.
-    order, own, apart = pattern.order, pattern.own, pattern.apart
-    angle = times - times.take(pattern.waypoints)[:, None]  # of each function and waypoint
+    order, own = pattern.order, pattern.own
+    pairs = times.take(pattern.between)
+    angle = pairs[0]  # of each function and waypoint
+    angle -= pairs[1]
     if half:
         angle *= half
         sine, cosine = np.sin(angle), np.cos(angle)
@@ -693,44 +698,40 @@ def _products_at_nodes(times: Array, half: float, pattern: Pattern, places: NDAr
         factors += own
         ratio = cosine - own
         ratio /= factors
-        odd, bends = _odd_functions(pattern, half)
-        sine *= odd
-        cosine[::2] = 1.0
     else:
         factors = angle
         factors += own
-        ratio = apart / factors
-    sums = np.zeros((max(order, 1) + 1, *own.shape))  # e_k, then V e_k
-    value, rows = sums[0], list(sums)
-    value[0] = 1.0
+        ratio = pattern.apart / factors
+    sums = pattern.first_sums.copy()  # e_k, then V e_k
+    value, *rows = sums[: order + 1]
     np.multiply.accumulate(factors[:-1], 0, None, value[1:])
-    ratio = ratio[:-1]
-    terms = ratio
-    for k in range(1, order + 1):
-        np.add.accumulate(terms, 0, None, rows[k][1:])
+    terms = ratio = ratio[:-1]
+    for k, row in enumerate(rows, 1):
+        np.add.accumulate(terms, 0, None, row[1:])
         if k < order:
-            terms = ratio * rows[k][:-1]
+            terms = ratio * row[:-1]
     if half:
-        turned = _with_cosine(rows[: order + 1], sine, cosine, bends)
-        for row, one in zip(rows[1:], turned, strict=False):
-            np.multiply(one, value, row)
+        odd, bends = _odd_functions(pattern, half)
+        sine *= odd
+        cosine[::2] = 1.0
+        _multiply_by_cosine(rows, sine, cosine, bends)
+    for row in rows:
+        row *= value
+    if half:
         value *= cosine
-    else:
-        for row in rows[1:]:
-            row *= value
     return sums.take(places).T
 
 
-def _with_cosine(rows: Sequence[Array], sine: Array, cosine: Array, bends: Sequence[Array]) -> list[Array]:
+def _multiply_by_cosine(rows: Sequence[Array], sine: Array, cosine: Array, bends: Sequence[Array]) -> None:
     """Sums e_1, e_2, ... with one more factor c(h) cosine - S(h) sine, reduced by powers of cosines."""
-    found = [cosine]
-    for k in range(1, len(rows)):
-        row = cosine * rows[k]
-        row -= sine * rows[k - 1] if k > 1 else sine
-        if k > 1:
-            row -= bends[k - 2] * found[k - 2]
-        found.append(row)
-    return found[1:]
+    less = sine
+    for k, row in enumerate(rows):
+        following = sine * row if k + 1 < len(rows) else sine
+        row *= cosine
+        row -= less
+        if k:
+            row -= bends[k - 1] * (rows[k - 2] if k > 1 else cosine)
+        less = following
 
 
 @lru_cache(maxsize=256)
@@ -772,8 +773,8 @@ def shared_system(
 
 
 @lru_cache(maxsize=256)
-def _taylor_scale(duration: float, pattern: Pattern) -> Array:
-    """Powers of a duration over factorials by constraint, as a column."""
+def _taylor_scale(duration: float, pattern: Pattern, naxes: int) -> Array:
+    """Powers of a duration over factorials by constraint, repeated for each axis: products of one shape are faster."""
     order = pattern.order
     try:
         powers = [duration**k / math.factorial(k) for k in range(order + 1)]
@@ -784,7 +785,7 @@ def _taylor_scale(duration: float, pattern: Pattern) -> Array:
             f"powers of the duration must stay within floating point, got {duration:g} s to the power "
             f"{order}; choose another unit of time"
         )
-    return readonly(np.array(powers).take(pattern.orders)[:, None])
+    return readonly(np.array(powers).take(pattern.orders)[:, None].repeat(naxes, axis=1))
 
 
 @lru_cache(maxsize=256)
@@ -965,6 +966,20 @@ class Pattern:
         return readonly((self.waypoints[:, None] == np.arange(self.nwaypoints)).astype(float))
 
     @cached_property
+    def between(self) -> NDArray[np.intp]:
+        """Waypoints, and those of the nodes of constraints (rows), (2, nconstraints, nwaypoints)."""
+        found = np.array(np.broadcast_arrays(np.arange(self.nwaypoints), self.waypoints[:, None]))
+        found.flags.writeable = False
+        return found
+
+    @cached_property
+    def first_sums(self) -> Array:
+        """Sums of `_products_at_nodes` without factors, (max(order, 1) + 1, nconstraints, nwaypoints)."""
+        found = np.zeros((max(self.order, 1) + 1, *self.own.shape))
+        found[0, 0] = 1.0
+        return readonly(found)
+
+    @cached_property
     def apart(self) -> Array:
         """The opposite, 0 for the node at the waypoint itself, else 1."""
         return readonly(1.0 - self.own)
@@ -1049,24 +1064,34 @@ def _leja(
     """
     used = None if all(given) else [i for i, own in enumerate(given) if own]
     u = times if used is None else [times[i] for i in used]
-    half, last, sin = 0.5 * alpha, len(u) - 1, math.sin
-    product = [abs(sin(half * (w - u[0]))) for w in u] if half else [w - u[0] for w in u]
+    half, count, sin = 0.5 * alpha, len(u), math.sin
+    if count < 3:
+        return tuple(range(count) if used is None else used), False
+    first, end, chosen, rest = u[0], u[-1], [0], list(range(1, count))
+    whole = abs(sin(half * (end - first))) if half else end - first
     if meet:
-        nearest = min([abs(sin(half * (w - v))) if half else w - v for v, w in pairwise(u)], default=0.0)
-        meet = last > 1 and product[-1] < _MEET * nearest
-    chosen = [0]
-    while len(chosen) < last:
-        farthest = last if meet and len(chosen) == 1 else product.index(max(product))
+        meet = whole < _MEET * min([abs(sin(half * (w - v))) if half else w - v for v, w in pairwise(u)])
+    if meet or half <= _INCREASING:  # the end is second
+        chosen.append(rest.pop())
+        scale = whole or 1.0
+        if half:
+            product = [abs(sin(half * (u[i] - first))) * (abs(sin(half * (u[i] - end))) / scale) for i in rest]
+        else:
+            product = [(u[i] - first) * ((end - u[i]) / scale) for i in rest]
+    else:
+        product = [abs(sin(half * (w - first))) for w in u[1:]]
+    while len(rest) > 1:
+        place = product.index(max(product))
+        # Rescaled, so that the products do not underflow for many waypoints.
+        scale, farthest = product.pop(place) or 1.0, rest.pop(place)
         chosen.append(farthest)
-        if len(chosen) < last:
-            # Rescaled, so that the products do not underflow for many waypoints.
-            scale, v = product[farthest] or 1.0, u[farthest]
+        if len(rest) > 1:
+            v = u[farthest]
             if half:
-                product = [p * (abs(sin(half * (w - v))) / scale) for p, w in zip(product, u, strict=True)]
+                product = [p * (abs(sin(half * (u[i] - v))) / scale) for p, i in zip(product, rest, strict=True)]
             else:
-                product = [p * (abs(w - v) / scale) for p, w in zip(product, u, strict=True)]
-    if last:
-        chosen.append(last * (last + 1) // 2 - sum(chosen))  # the only one that is left
+                product = [p * (abs(u[i] - v) / scale) for p, i in zip(product, rest, strict=True)]
+    chosen += rest
     return tuple(chosen if used is None else [used[i] for i in chosen]), meet
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import cached_property, lru_cache
-from operator import sub
+from itertools import pairwise
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -153,7 +153,7 @@ class NewtonSpline(WaypointSpline):
         systems: dict[Kind, NewtonSystem] = {}
         parts, near = [], options.warn
         for kind, axes in _groups(patterns, options.gamma, table, alpha).items():
-            system = lent.get(kind) or _system(alpha, relative, apart, kind, options)
+            system = (lent and lent.get(kind)) or _system(alpha, relative, apart, kind, options)
             systems[kind] = system
             data = system.entries(table)
             if len(axes) < table.shape[2]:
@@ -373,7 +373,7 @@ def _fitted(system: NewtonSystem, data: Array, times: list[float], duration: flo
     ValueError
         If a coefficient overflows, or is too inaccurate.
     """
-    found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
+    found = system.fitted(data, times, duration, data * system.taylor_scale(duration, data.shape[1]))
     near = check and system.stays_near(found, data)
     if not near and not (are_finite(found.T) or np.isfinite(found).all()):
         raise ValueError(
@@ -385,9 +385,10 @@ def _fitted(system: NewtonSystem, data: Array, times: list[float], duration: flo
 
 def _apart(times: list[float], relative: tuple[float, ...], duration: float) -> Array | None:
     """Differences of the normalised times, if those of the rounded times would lose digits."""
-    if min(map(sub, relative[1:], relative), default=1.0) > 1e-4:
-        return None
-    return np.subtract.outer(times, times) / duration
+    for before, after in pairwise(relative):
+        if after - before <= 1e-4:
+            return np.subtract.outer(times, times) / duration
+    return None
 
 
 def _same_pattern(donor: NewtonSpline, relative: tuple[float, ...], apart: Array | None) -> bool:
@@ -407,11 +408,13 @@ def _size(alpha: float, count: int, degree: int) -> int:
 
 def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
     """Entries (waypoint, order, axis), and the orders prescribed at each waypoint for each axis."""
-    jets = [w.jet for w in waypoints]
-    sizes, naxes = {len(jet) for jet in jets}, waypoints[0].naxes
-    if len(sizes) == 1 and all([w.complete for w in waypoints]):
+    naxes, jets = waypoints[0].naxes, [w.jet for w in waypoints if w.complete]
+    sizes = set(map(len, jets))
+    if len(sizes) == 1 and len(jets) == len(waypoints):
         (size,) = sizes
         return joined(jets).reshape(len(jets), size, naxes), [_complete(len(jets), size)] * naxes
+    jets = [w.jet for w in waypoints]
+    sizes = set(map(len, jets))
     table = np.full((len(jets), max(sizes), naxes), np.nan)
     for row, jet in zip(table, jets, strict=True):
         row[: len(jet)] = jet

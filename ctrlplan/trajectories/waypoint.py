@@ -161,7 +161,8 @@ class Waypoint(Displayed, Fields):
             order, axis = np.argwhere(np.isinf(jet))[0]
             name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
             raise ValueError(f"{name} must be finite or nan (free), got {jet[order, axis]} at time {time:g}")
-        jet.setflags(write=False)
+        if jet.flags.writeable:
+            jet.setflags(write=False)
         self._fill(time=time, jet=jet, labels=labels, complete=complete, naxes=jet.shape[1])
 
     @property
@@ -384,14 +385,17 @@ def _prescribed(value: float) -> str:
 
 
 def _rows(entries: list[Any]) -> Array | None:
-    """Table (order, axis) of arrays of floats of one shape; None for all other entries."""
-    shape: tuple[int, ...] = entries[0].shape if type(entries[0]) is np.ndarray else ()
-    if len(shape) != 1 or not shape[0]:
+    """Table (order, axis) of arrays of floats of one length, read-only; None for all other entries."""
+    naxes = len(entries[0]) if type(entries[0]) is np.ndarray and entries[0].ndim else 0
+    if not naxes:
         return None
     for entry in entries:
-        if type(entry) is not np.ndarray or entry.dtype is not _DOUBLE or entry.shape != shape:
+        if type(entry) is not np.ndarray or entry.dtype is not _DOUBLE or entry.ndim != 1 or len(entry) != naxes:
             return None
-    return joined(entries).reshape(len(entries), -1)
+    try:
+        return np.ndarray((len(entries), naxes), _DOUBLE, b"".join(entries))  # a quarter of the time of np.array
+    except TypeError:  # not contiguous
+        return np.array(entries)
 
 
 _DOUBLE = np.dtype(float)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from operator import lt
 from typing import Any, ClassVar, Self
 
 from ctrlplan._checks import check_kind
@@ -218,11 +217,6 @@ def checked_waypoints(waypoints: Iterable[Waypoint], minimum: int = 2) -> tuple[
 
 def increasing(points: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
     """Waypoints, checked for equal axes and increasing times."""
-    if all([isinstance(point, Waypoint) for point in points]):
-        naxes, labels, times = points[0].naxes, points[0].labels, [point.time for point in points]
-        same = all([point.naxes == naxes and point.labels == labels for point in points])
-        if same and all(map(lt, times, times[1:])):
-            return points
     before: Waypoint | None = None
     for i, point in enumerate(points):
         if not isinstance(point, Waypoint):

@@ -272,3 +272,19 @@ def test_systems_that_amplify_rounding_are_never_taken_for_mild(alpha):
             assert system._is_mild == (amplification < 1e5)
             seen.add(system._is_mild)
     assert seen == {False, True}
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0, 2.9, 3.1, 5.0])
+def test_waypoints_are_used_in_leja_order(alpha):
+    """Each has the largest product of distances on the circle to those before, of all that are left."""
+    rng = np.random.default_rng(3)
+    for count in (2, 3, 4, 6, 9):
+        times = np.array([0.0, *np.sort(rng.uniform(0.05, 0.95, count - 2)), 1.0])
+        found = NewtonSystem(alpha, times, ((0,),) * count).waypoint_index.tolist()
+        apart = np.subtract.outer(times, times)
+        apart = np.abs(np.sin(0.5 * alpha * apart)) if alpha else np.abs(apart)
+        assert found[0] == 0
+        assert sorted(found) == list(range(count))
+        for k in range(1, count):
+            products = np.log(apart[found[k:]][:, found[:k]]).sum(axis=1)
+            assert products.argmax() == 0
