@@ -431,7 +431,7 @@ class SampledMotion:
     def _direct(self, which: NDArray[np.intp], d: Array, fractions: Array) -> Array:
         """Chebyshev series (nspans, nterms, nrows) of combinations of the functions of time at fractions of spans."""
         order = self._kernel.order
-        values = self._values[which].reshape(which.size, order, -1) @ d.T
+        values = self._values[which].reshape(which.size, order, d.shape[1]) @ d.T
         table = legendre.legvander(2.0 * fractions - 1.0, order - 1) @ to_legendre(order)
         return np.einsum("jp,kpr->kjr", transform(np.eye(fractions.size)).T @ table, values)
 

@@ -27,7 +27,7 @@ from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array
 from ctrlplan.studies.outcomes import Failed
 
-_STUDY = "study.json"
+_STUDY, _OUTCOMES = "study.json", "outcomes-*.npz"
 _SECONDS = 10.0
 """Time [s] after which finished outcomes are written, even if they are few."""
 
@@ -62,7 +62,7 @@ class Checkpoint:
         ------
         ValueError
             If the path is an empty text, or the folder has the checkpoint of another
-            study.
+            study, or outcomes without the file that identifies theirs.
         OSError
             If it is a file, or the folder cannot be made or written to.
         """
@@ -75,8 +75,14 @@ class Checkpoint:
         with _used(path):
             path.mkdir(parents=True, exist_ok=True)
             text = known.read_text(encoding="utf-8") if known.exists() else None
-            if text is None:
+            unknown = text is None and any(path.glob(_OUTCOMES))
+            if text is None and not unknown:
                 write_text(known, json.dumps(study, indent=1))
+        if unknown:
+            raise ValueError(
+                f"checkpoint must have the file {_STUDY} that identifies its study, got outcomes without it in {path}; "
+                "give a new folder, or delete this one"
+            )
         if text is not None:
             found = _json(known, text)
             differ = [name for name in dict.fromkeys((*study, *found)) if not _same(study.get(name), found.get(name))]
@@ -101,7 +107,7 @@ class Checkpoint:
             If a file is damaged.
         """
         seen: set[int] = set()
-        for path in sorted(self.folder.glob("outcomes-*.npz")):
+        for path in sorted(self.folder.glob(_OUTCOMES)):
             try:
                 with np.load(io.BytesIO(path.read_bytes())) as file:
                     stored, data = json.loads(str(file["outcomes"])), file["data"]

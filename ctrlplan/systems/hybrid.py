@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
 import control as ct
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ctrlplan._checks import check_kind, checked_finite, checked_names, checked_vector, one_number
 from ctrlplan._renamed import former_signature
 from ctrlplan._types import Array, Params, System, Value
-from ctrlplan.traits import DeclaredTrait, declare
+from ctrlplan.traits import DeclaredTrait, declare, traits_of
 
 
 class SampledBlock(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -137,9 +137,10 @@ def sample_hold(
     Raises
     ------
     TypeError
-        If `block` is not a control system, or another argument has the wrong type.
+        If `block` is not a control system or has a frequency response only, or another
+        argument has the wrong type.
     ValueError
-        If it is continuous with states or has another period, a time is out of
+        If it is continuous with states, contains a delay, or has another period, a time is out of
         range, or the number of names differs from the number of signals.
 
     Examples
@@ -158,6 +159,13 @@ def sample_hold(
     [0.0, 0.1, 0.19]
     """
     check_kind(block, "block", ct.InputOutputSystem, "a control system")
+    if isinstance(block, ct.FrequencyResponseData):
+        raise TypeError(f"block must have equations, got {block.name} with its frequency response only; fit a model")
+    for delay in _delays(block):
+        raise ValueError(
+            f"block must be discrete or static, got {block.name} with the delay {delay}; connect the delay to the "
+            "inputs or outputs of what is sampled"
+        )
     period = checked_finite(dt, "dt", above=0.0)
     start = checked_finite(offset, "offset", minimum=0.0)
     if block.dt == 0 and (block.nstates or isinstance(block, ct.TransferFunction)):
@@ -169,6 +177,14 @@ def sample_hold(
     given = block.input_labels if inputs is None else checked_names(inputs, "inputs", block.ninputs)
     held = block.output_labels if outputs is None else checked_names(outputs, "outputs", block.noutputs)
     return SampleHold(block, period, start, given, held, name or block.name)
+
+
+def _delays(block: System) -> Iterator[str]:
+    """Names of the delays in a block."""
+    if traits_of(block).delay is not None:
+        yield block.name
+    for inner in getattr(block, "syslist", ()):
+        yield from _delays(inner)
 
 
 @former_signature("inputs", "outputs", "initial", "name")

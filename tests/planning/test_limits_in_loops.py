@@ -495,3 +495,23 @@ def test_a_figure_shows_the_signals_of_the_loop(loop):
     assert rows["RMS of u"][-1] == pytest.approx(math.sqrt(np.mean(signals["u"][t <= MOVE.end] ** 2)), rel=0.03)
     if found is not None:
         assert found.plot().axes.shape == (4, 1)
+
+
+@pytest.mark.parametrize("end", [1.0, 1.05, 0.7])
+def test_the_error_of_a_sampled_loop_by_its_recursion(end):
+    """The plan breaks at sample instants, or not: the error contains the plan between them."""
+    plan = cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(end, 1, 0, 0)])
+    plant = ct.ss(-1, 1, 1, 0, inputs="u", outputs="y", name="plant")
+    gain = cp.sample_hold(ct.ss([], [], [], [[5.0]], 0.1, inputs="e", outputs="u", name="gain"), 0.1)
+    junction = ct.summing_junction(["r", "-y"], "e", name="junction")
+    loop = ct.interconnect([gain, plant, junction], inputs="r", outputs=["y", "u", "e"])
+    fractions, y, errors = np.linspace(0.0, 0.1, 4001), 0.0, []
+    for k in range(14):
+        r = plan(np.minimum(0.1 * k + fractions, end))
+        held = 5.0 * (r[0] - y)
+        path = held + (y - held) * np.exp(-fractions)
+        errors.append(np.abs(r - path).max())
+        y = path[-1]
+    found = only(margins(plan, {"e": 1.0}, loop))
+    assert found.value == pytest.approx(max(errors), rel=1e-7)  # the grid of the recursion is 25 us
+    assert fastest(plan, {"e": 0.2}, loop).margins.satisfied

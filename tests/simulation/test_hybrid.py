@@ -285,6 +285,8 @@ def test_the_exact_method_rejects_them(system):
 
 
 HELD = ct.ss(0.5, 1.0, 1.0, 0.0, 0.1, name="held")
+LATE = ct.interconnect([cp.create_delay_iosystem(0.2, inputs="a", outputs="b", name="inner")], inputs="a", outputs="b")
+LATE.name = "outer"
 
 
 @pytest.mark.parametrize(
@@ -301,6 +303,13 @@ HELD = ct.ss(0.5, 1.0, 1.0, 0.0, 0.1, name="held")
         ((HELD, 0.1, math.nan), ValueError, "offset must be finite and at least 0, got nan"),
         ((plant(), 0.1), ValueError, "block must be discrete, got plant with dt = 0: see control.sample_system"),
         ((ct.tf([1], [1, 1], name="lag"), 0.1), ValueError, "block must be discrete, got lag"),
+        ((ct.frd([1, 2], [1, 2], name="data"), 0.1), TypeError, "block must have equations, got data with a frequency"),
+        ((cp.create_delay_iosystem(0.1, name="late"), 0.1), ValueError, "got late with the delay late; connect the"),
+        (
+            (LATE, 0.1),
+            ValueError,
+            "block must be discrete or static, got outer with the delay inner; connect the delay",
+        ),
     ],
 )
 def test_bad_sampled_blocks(arguments, error, match):

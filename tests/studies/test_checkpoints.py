@@ -137,6 +137,15 @@ def test_the_checkpoint_of_another_study_is_an_error(other, said, tmp_path):
     assert sorted(path.read_bytes() for path in tmp_path.iterdir()) == before
 
 
+def test_outcomes_of_an_unknown_study_are_an_error(tmp_path):
+    swept(lag, tmp_path)
+    (tmp_path / "study.json").unlink()
+    before = sorted(path.read_bytes() for path in tmp_path.iterdir())
+    with pytest.raises(ValueError, match=r"checkpoint must have the file study.json .* got outcomes without it in"):
+        swept(lag, tmp_path)
+    assert sorted(path.read_bytes() for path in tmp_path.iterdir()) == before
+
+
 def test_draws_of_another_loop_are_an_error(tmp_path):
     drawn(lag, tmp_path)
     with pytest.raises(ValueError, match=r"checkpoint must be a folder of the same study, .* in loop; give a new"):

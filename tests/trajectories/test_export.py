@@ -400,6 +400,23 @@ def test_points_of_a_cam_are_as_many_as_the_position_requires(tmp_path):
     assert 0.5 * wanted <= stated_errors(tmp_path / "plan.cam.csv")["y"] <= wanted
 
 
+@pytest.mark.parametrize(
+    "plan",
+    [
+        cp.Trapezoid(1.0, velocity=1.0, acceleration=2.0),
+        cp.Trapezoid([3e-6, 2e-6], velocity=1e-3, acceleration=40.0).shift(7.0),
+        cp.PiecewiseSpline([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0), cp.Waypoint(2, 0.5, 0)]),
+        cp.PiecewiseSpline([cp.Waypoint(0, 0, 0), cp.Waypoint(0.3, 40, 90), cp.Waypoint(9, 41, 2)], alpha=2.5),
+    ],
+)
+def test_points_of_a_cam_keep_the_position_where_the_acceleration_jumps(plan, tmp_path):
+    plan.export(tmp_path / "plan.cam.csv")
+    table, t = read_csv(tmp_path / "plan.cam.csv"), np.linspace(plan.start, plan.end, 100_001)
+    for label, values in zip(plan.labels, plan.jet(t, 0)[0], strict=True):
+        assert np.abs(hermite(table, label)(t) - values).max() <= 1.001e-6 * np.ptp(values)
+    assert table["master"].size < 100
+
+
 def test_a_jump_of_the_acceleration_is_in_the_error(tmp_path):
     """A cam has one acceleration a point: that after the jump."""
     plan = cp.Trapezoid(3.0, velocity=1.0, acceleration=0.5)

@@ -116,18 +116,10 @@ def cam_of(plan: Trajectory, options: Options) -> Cam:
                 f"{('position', 'velocity')[jump.order]} of a cam must be continuous, got a jump of {jump.label} by "
                 f"{jump.size:.4g} at {jump.time:g} s"
             )
+    jumps = [(jump.time, plan.labels.index(jump.label), abs(jump.size)) for jump in inner]
     peaks = np.array([segment_peak(plan, segment, 6) for segment in range(plan.breakpoints.size - 1)])
     if options.timepts is None and options.dt is None:
-        extrema = plan.extrema()
-        allowed = _TOLERANCE * (extrema.maximum - extrema.minimum) / _HERMITE[0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            longest = np.where(peaks > 0.0, (allowed / peaks) ** (1.0 / 6.0), np.inf).min(axis=1)
-        counts = np.ceil(np.diff(plan.breakpoints) / longest).clip(1.0)
-        parts = [
-            np.linspace(*edges, int(count) + 1)
-            for edges, count in zip(pairwise(plan.breakpoints.tolist()), counts, strict=True)
-        ]
-        times = np.unique(np.concatenate(parts))
+        times = _resolving(plan, peaks, jumps)
     else:
         wanted = options.times(plan.start, plan.end)
         times = np.union1d(wanted if options.dt is None else np.minimum(wanted, plan.end), plan.breakpoints)
@@ -136,15 +128,50 @@ def cam_of(plan: Trajectory, options: Options) -> Cam:
             f"timepts of a cam must lie between the plan's start {plan.start:g} s and end {plan.end:g} s, got "
             f"{times[0]:g} s to {times[-1]:g} s"
         )
-    return Cam(times, plan.jet(times, 2), _error(plan, times, peaks, [(j.time, j.label, j.size) for j in inner]))
+    return Cam(times, plan.jet(times, 2), _error(plan, times, peaks, jumps))
 
 
-def _error(plan: Trajectory, times: Array, peaks: Array, jumps: list[tuple[float, str, float]]) -> Array:
-    """Bound (3, naxes) of the error between points."""
+def _resolving(plan: Trajectory, peaks: Array, jumps: list[tuple[float, int, float]]) -> Array:
+    """Times of points between which the error of the position is at most `_TOLERANCE` of its range.
+
+    Before a jump of the acceleration there is one short interval.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        The plan.
+    peaks : ndarray, shape (nsegments, naxes)
+        Bounds of the sixth derivative.
+    jumps : list of (float, int, float)
+        Time [s], axis and magnitude of each jump of an acceleration.
+    """
+    extrema = plan.extrema()
+    allowed = _TOLERANCE * (extrema.maximum - extrema.minimum)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        longest = np.where(peaks > 0.0, (allowed / _HERMITE[0] / peaks) ** (1.0 / 6.0), np.inf).min(axis=1)
+    last = np.full(longest.size, np.inf)
+    for time, axis, size in jumps:
+        segment = int(np.searchsorted(plan.breakpoints, time)) - 1
+        # Half of the longest interval has 1/64 of the other error.
+        length = min(0.5 * longest[segment], math.sqrt(63.0 / 64.0 * allowed[axis] / (_JUMP[0] * size)))
+        last[segment] = min(last[segment], length)
+    parts: list[Array] = []
+    for (begin, end), length, short in zip(pairwise(plan.breakpoints.tolist()), longest, last, strict=True):
+        count = math.ceil(max((end - begin) / length, 1.0))
+        if short < (end - begin) / count:
+            count = math.ceil(max((end - short - begin) / length, 1.0))
+            parts += [np.linspace(begin, end - short, count + 1), np.array([end])]
+        else:
+            parts.append(np.linspace(begin, end, count + 1))
+    return np.unique(np.concatenate(parts))
+
+
+def _error(plan: Trajectory, times: Array, peaks: Array, jumps: list[tuple[float, int, float]]) -> Array:
+    """Bound (3, naxes) of the error between points; jumps as for `_resolving`."""
     h = np.diff(times)
     segment = np.searchsorted(plan.breakpoints, times[:-1], side="right") - 1
     error = _HERMITE[:, None, None] * h[:, None] ** (6 - _ORDERS)[:, None, None] * peaks[segment]
-    for time, label, size in jumps:
+    for time, axis, size in jumps:
         before = int(np.searchsorted(times, time)) - 1
-        error[:, before, plan.labels.index(label)] += _JUMP * h[before] ** (2 - _ORDERS) * abs(size)
+        error[:, before, axis] += _JUMP * h[before] ** (2 - _ORDERS) * size
     return error.max(axis=1)
