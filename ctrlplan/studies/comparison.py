@@ -413,8 +413,8 @@ def compare(
     Raises
     ------
     ValueError
-        If there is no plan, plans differ in axes, a plan affects no output that
-        follows it, `start` or `band` is out of range, or a name in `outputs`,
+        If there is no plan, waypoints are given twice, plans differ in axes, a plan
+        affects no output that follows it, `start` or `band` is out of range, or a name in `outputs`,
         `controls`, `measures` or `units` is unknown.
     TypeError
         If a plan is not a trajectory, or an argument has a wrong type.
@@ -445,6 +445,8 @@ def compare(
     """
     waypoints = waypoints_given(waypoints, "waypoints", "Waypoints")
     if not isinstance(plans, Mapping):
+        if waypoints:
+            raise ValueError("waypoints must be given once, got them as plans and as waypoints; omit waypoints=")
         waypoints = waypoints_given(plans)
         plans = references_of(waypoints, alpha)
     experiment = Experiment.from_arguments(locals())

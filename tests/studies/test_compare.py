@@ -136,6 +136,7 @@ def test_outputs_and_controls_can_be_named():
     ("plans", "options", "kind", "message"),
     [
         ({}, {}, ValueError, "plans must contain at least one trajectory, got none"),
+        (MOVE, {"waypoints": MOVE}, ValueError, "waypoints must be given once, got them as plans and as waypoints"),
         ({"a": 1.0}, {}, TypeError, r"plans\['a'\] must be a Trajectory, got float"),
         (
             {"a": cp.Step(1.0), "b": cp.Step([1.0, 2.0])},
