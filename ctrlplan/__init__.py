@@ -218,7 +218,7 @@ __all__ = sorted([*_HOME, *_FOLDERS])
 def __getattr__(name: str) -> Any:
     if name in _FOLDERS:
         return import_module(f"ctrlplan.{name}")
-    return _later.loaded_later(__name__, _HOME)(name)
+    return _later.loaded_later(globals(), _HOME)(name)
 
 
 def __dir__() -> list[str]:

@@ -7,12 +7,14 @@ from importlib import import_module
 from typing import Any
 
 
-def loaded_later(package: str, home: Mapping[str, str]) -> Callable[[str], Any]:
-    """Function `__getattr__` of a package, from the module of each name."""
+def loaded_later(own: dict[str, Any], home: Mapping[str, str]) -> Callable[[str], Any]:
+    """Function `__getattr__` of a package, from its globals and the module of each name."""
+    package = own["__name__"]
 
     def found(name: str) -> Any:
         if name not in home:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(f"{package}.{home[name]}"), name)
+        own[name] = value = getattr(import_module(f"{package}.{home[name]}"), name)
+        return value  # from now on an attribute of the package
 
     return found

@@ -169,3 +169,4 @@ def test_names_that_a_package_loads_later_are_those_that_type_checkers_see(packa
         assert getattr(loaded, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = loaded.nothing
+    assert loaded._HOME.keys() <= vars(loaded).keys()  # from the second reading on they are plain attributes

@@ -128,7 +128,7 @@ _HOME = {
 """Modules of names that a run does not require; they are loaded when a name is first read."""
 
 
-__getattr__ = _later.loaded_later(__name__, _HOME)
+__getattr__ = _later.loaded_later(globals(), _HOME)
 
 
 def __dir__() -> list[str]:

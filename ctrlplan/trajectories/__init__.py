@@ -125,7 +125,7 @@ _HOME = {
 """Module of each name, loaded when the name is first read."""
 
 
-__getattr__ = _later.loaded_later(__name__, _HOME)
+__getattr__ = _later.loaded_later(globals(), _HOME)
 
 
 def __dir__() -> list[str]:
