@@ -33,6 +33,7 @@ from ctrlplan.planning.scalar_search import bisected, bottom, scan
 from ctrlplan.planning.time_law import with_fast_time_law
 from ctrlplan.trajectories import PathPlan, Retimed, Trajectory, WaypointSpline
 from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.continuity import constant_axes
 from ctrlplan.trajectories.extrema import search_extrema
 
 if TYPE_CHECKING:
@@ -912,6 +913,7 @@ def _check_open(plan: Trajectory) -> None:
     size, extrema = np.stack([plan.peak(nu) for nu in range(3)]), plan.extrema()
     slack = 1e-9 * size
     slack[0] = 1e-9 * (extrema.maximum - extrema.minimum) + 1e-14 * size[0]
+    slack[:, constant_axes(extrema.minimum, extrema.maximum)] = np.inf
     same = [bool(row.all()) for row in np.abs(last - first) <= slack]
     moves = [bool(row.any()) for row in np.abs(first) > slack]
     if same[0] and same[1] and (moves[1] or (same[2] and moves[2])):

@@ -15,6 +15,7 @@ from ctrlplan._checks import checked_finite, checked_labels, default_labels
 from ctrlplan._display import counted, time_text
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, readonly
+from ctrlplan.trajectories.continuity import POSITION_ROUNDING
 from ctrlplan.trajectories.files import trajectory_from_dict
 from ctrlplan.trajectories.trajectory import Trajectory, check_end
 
@@ -462,5 +463,5 @@ def join_slack(*parts: Trajectory) -> Array:
     extrema = [part.extrema() for part in parts]
     ranges = np.max([e.maximum - e.minimum for e in extrema], axis=0)
     size = np.max([np.maximum(np.abs(e.minimum), np.abs(e.maximum)) for e in extrema], axis=0)
-    slack: Array = 1e-9 * ranges + 8.0 * np.finfo(float).eps * size
+    slack: Array = 1e-9 * ranges + POSITION_ROUNDING * size
     return slack

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from ctrlplan._types import Array
     from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -39,7 +41,8 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
 
     The plan is at rest before its start and after its end: a plan that starts
     at nonzero velocity jumps there. Differences below 1e-9 of a derivative's peak, or of the
-    range of the position, are rounding, as are those that the rounding of late times explains.
+    range of the position, are rounding, as are those that the rounding of late times or of lower
+    derivatives (`_by_rounding_of_lower`) explains.
     """
     before, after = _sides(plan, order)
     size = after - before
@@ -49,12 +52,14 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     if not (np.abs(size) > _slacks(samples)[:, :, None]).any():  # further samples could only add to what is rounding
         return ()
     inside = plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * _INSIDE
-    slack = _slacks(np.concatenate([samples, plan.jet(inside.ravel(), order)], axis=-1))
+    samples = np.concatenate([samples, plan.jet(inside.ravel(), order)], axis=-1)
+    slack = _slacks(samples)
+    beyond = np.abs(size) > _by_rounding_of_lower(np.diff(plan.breakpoints), np.abs(size), np.abs(samples).max(axis=-1))
     # Extrema of samples are nearer to 0 than those of the plan, which are computed for orders that may jump alone.
-    for k in np.flatnonzero((np.abs(size) > slack[:, :, None]).any(axis=(1, 2))).tolist():
+    for k in np.flatnonzero((beyond & (np.abs(size) > slack[:, :, None])).any(axis=(1, 2))).tolist():
         exact = plan.extrema(k)
         slack[k] = _slack(k, exact.minimum, exact.maximum)
-    jumps = np.abs(size) > slack[:, :, None]
+    jumps = beyond & (np.abs(size) > slack[:, :, None])
     if jumps.any():
         jumps &= np.abs(size) > _by_rounding_of_times(plan, order)
     found = np.argwhere(jumps)
@@ -66,6 +71,23 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
 
 _INSIDE = np.array([0.1, 0.3, 0.45, 0.65, 0.85])
 """Parts of a segment at which a plan is sampled."""
+
+POSITION_ROUNDING = 64.0 * float(np.finfo(float).eps)
+"""Rounding of positions relative to their peak, with that of the solution for the coefficients of a spline."""
+
+_ROUNDING = 16.0 * float(np.finfo(float).eps)
+"""Rounding of a derivative relative to its peak."""
+
+_GROWTH = 72.0
+"""Bound 2 n^2 of Markov's inequality for polynomials of degree n = 6 on a segment of length 1."""
+
+_SHORTEST = 1e-6
+"""Length relative to the duration below which a segment is not one of a spline, but between breakpoints of axes."""
+
+
+def constant_axes(minimum: Array, maximum: Array) -> NDArray[np.bool_]:
+    """Axes (naxes,) whose positions change by rounding alone, so that all their derivatives are rounding."""
+    return np.asarray(maximum - minimum <= POSITION_ROUNDING * np.maximum(np.abs(minimum), np.abs(maximum)))
 
 
 def _sides(plan: Trajectory, order: int) -> tuple[Array, Array]:
@@ -91,6 +113,33 @@ def _by_rounding_of_times(plan: Trajectory, order: int) -> Array:
     return 4.0 * np.spacing(np.abs(plan.breakpoints)) * np.abs(sides).max(axis=0)
 
 
+def _by_rounding_of_lower(lengths: Array, sizes: Array, peaks: Array) -> Array:
+    """Differences (order + 1, naxes, nbreakpoints) that the rounding of the derivative below explains; 0 for positions.
+
+    By Markov's inequality, an error e of a polynomial of degree n on a segment of length h changes
+    its derivative by at most 2 n^2 e/h. The error of a derivative is `_ROUNDING` of its peak, or
+    its difference here or at the next breakpoints, if that is rounding itself. With differences as
+    they are, and not their bounds, the result is of the size eps peak/h^k only where the lower
+    derivatives show errors of that size, as the coefficients of a fitted spline do. Those of
+    coefficients given exactly do not, and their small jumps remain.
+    """
+    if not lengths.size:
+        return np.zeros_like(sizes)
+    steps = np.maximum(lengths, _SHORTEST * lengths.sum())
+    steps = np.minimum(np.append(steps[0], steps), np.append(steps, steps[-1]))
+    found = np.zeros_like(sizes)
+    bound = POSITION_ROUNDING * peaks[0, :, None]
+    for k in range(1, len(sizes)):
+        error = np.where(sizes[k - 1] <= bound, sizes[k - 1], 0.0)
+        near = error.copy()
+        near[:, 1:] = np.maximum(near[:, 1:], error[:, :-1])
+        near[:, :-1] = np.maximum(near[:, :-1], error[:, 1:])
+        with np.errstate(over="ignore"):
+            found[k] = _GROWTH / steps * np.maximum(near, _ROUNDING * peaks[k - 1, :, None])
+        bound = found[k]
+    return found
+
+
 def _slacks(samples: Array) -> Array:
     """Sizes of differences that are rounding (order + 1, naxes), for samples of the derivatives."""
     minimum, maximum = samples.min(axis=-1), samples.max(axis=-1)
@@ -103,5 +152,5 @@ def _slack(order: int, minimum: Array, maximum: Array) -> Array:
     """Size of a difference that is rounding, for the extrema of a derivative, shape (..., naxes)."""
     peak = np.maximum(np.abs(minimum), np.abs(maximum))
     # Relative to the range: a distant origin of the positions hides no jump.
-    found = 1e-9 * peak if order else 1e-9 * (maximum - minimum) + 8.0 * np.finfo(float).eps * peak
+    found = 1e-9 * peak if order else 1e-9 * (maximum - minimum) + POSITION_ROUNDING * peak
     return np.maximum(found, np.finfo(float).tiny)

@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.continuity import constant_axes
 
 _STILL = 1e-9
 """Velocity below which a plan is at rest, relative to its peak."""
@@ -183,6 +185,11 @@ def _joint(before: Array, after: Array, still: Array, stops: bool = True) -> Joi
     return Joint(False, False, ratio, bend)
 
 
+def _still(peaks: Array, constant: NDArray[np.bool_]) -> Array:
+    """Velocities and accelerations (2, naxes) that are 0: all of them on axes that are constant up to rounding."""
+    return np.where(constant, np.inf, _STILL * peaks)
+
+
 def spans_of(plan: Trajectory, stops: bool, edges: Sequence[float], origin: float) -> tuple[list[Span], list[Joint]]:
     """Spans between breakpoints and waypoints, and the points between them."""
     segments, starts, ends = [], [], []
@@ -202,7 +209,8 @@ def spans_of(plan: Trajectory, stops: bool, edges: Sequence[float], origin: floa
     times = np.array(starts)[:, None] + (np.array(ends) - np.array(starts))[:, None] * fractions
     jets = plan.segments_jet(np.repeat(segments, fractions.size), times.ravel(), 2)
     jets = jets.reshape(3, plan.naxes, len(segments), fractions.size)
-    still = _STILL * np.abs(jets[1:]).max(axis=(2, 3))
+    low, high = jets[0].min(axis=(1, 2)), jets[0].max(axis=(1, 2))
+    still = _still(np.abs(jets[1:]).max(axis=(2, 3)), constant_axes(low, high))
     moves = (np.abs(jets[1]) > still[0, :, None, None]).any(axis=(0, 2))
     rests = _powers(jets[1] / np.where(still[0] > 0.0, still[0], 1.0)[:, None, None])
     spans = [
@@ -243,7 +251,8 @@ def _is_corner(plan: Trajectory, before: Sequence[Span], after: Sequence[Span]) 
     if last is None or first is None:
         return False
     peaks = plan.peak(1)
-    moving = peaks > 0.0
+    extrema = plan.extrema()
+    moving = (peaks > 0.0) & ~constant_axes(extrema.minimum, extrema.maximum)
     tangents = [_direction(plan, *end)[moving] / peaks[moving] for end in ((last, 1), (first, 0))]
     sizes = [float(np.linalg.norm(tangent)) for tangent in tangents]
     if not all(0.0 < size < np.inf for size in sizes):
@@ -275,5 +284,7 @@ def closing_joint(plan: Trajectory) -> Joint | None:
     slack = 1e-9 * (extrema.maximum - extrema.minimum) + 1e-14 * np.abs(first[0])
     if (np.abs(last[0] - first[0]) > slack).any():
         return None
-    joint = _joint(last, first, _STILL * np.stack([plan.peak(1), plan.peak(2)]))
+    constant = constant_axes(extrema.minimum, extrema.maximum)
+    peaks = np.stack([plan.peak(1), plan.peak(2)])
+    joint = _joint(last, first, _still(peaks, constant))
     return joint if abs(joint.ratio - 1.0) <= 1e-7 else None
