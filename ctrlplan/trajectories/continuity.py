@@ -54,7 +54,7 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     inside = plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * _INSIDE
     samples = np.concatenate([samples, plan.jet(inside.ravel(), order)], axis=-1)
     slack = _slacks(samples)
-    beyond = np.abs(size) > _by_rounding_of_lower(np.diff(plan.breakpoints), np.abs(size), np.abs(samples).max(axis=-1))
+    beyond = np.abs(size) > _by_rounding_of_lower(np.diff(plan.breakpoints), np.abs(size), samples)
     # Extrema of samples are nearer to 0 than those of the plan, which are computed for orders that may jump alone.
     for k in np.flatnonzero((beyond & (np.abs(size) > slack[:, :, None])).any(axis=(1, 2))).tolist():
         exact = plan.extrema(k)
@@ -113,7 +113,7 @@ def _by_rounding_of_times(plan: Trajectory, order: int) -> Array:
     return 4.0 * np.spacing(np.abs(plan.breakpoints)) * np.abs(sides).max(axis=0)
 
 
-def _by_rounding_of_lower(lengths: Array, sizes: Array, peaks: Array) -> Array:
+def _by_rounding_of_lower(lengths: Array, sizes: Array, samples: Array) -> Array:
     """Differences (order + 1, naxes, nbreakpoints) that the rounding of the derivative below explains; 0 for positions.
 
     By Markov's inequality, an error e of a polynomial of degree n on a segment of length h changes
@@ -122,12 +122,16 @@ def _by_rounding_of_lower(lengths: Array, sizes: Array, peaks: Array) -> Array:
     they are, and not their bounds, the result is of the size eps peak/h^k only where the lower
     derivatives show errors of that size, as the coefficients of a fitted spline do. Those of
     coefficients given exactly do not, and their small jumps remain.
+
+    If a position or velocity is constant up to rounding, all its derivatives are rounding: a velocity
+    if it moves the position by less than the rounding of that in the shortest segment.
     """
     if not lengths.size:
         return np.zeros_like(sizes)
     steps = np.maximum(lengths, _SHORTEST * lengths.sum())
     steps = np.minimum(np.append(steps[0], steps), np.append(steps, steps[-1]))
     found = np.zeros_like(sizes)
+    low, high, peaks = samples.min(axis=-1), samples.max(axis=-1), np.abs(samples).max(axis=-1)
     bound = POSITION_ROUNDING * peaks[0, :, None]
     for k in range(1, len(sizes)):
         error = np.where(sizes[k - 1] <= bound, sizes[k - 1], 0.0)
@@ -137,6 +141,10 @@ def _by_rounding_of_lower(lengths: Array, sizes: Array, peaks: Array) -> Array:
         with np.errstate(over="ignore"):
             found[k] = _GROWTH / steps * np.maximum(near, _ROUNDING * peaks[k - 1, :, None])
         bound = found[k]
+    found[1:, constant_axes(low[0], high[0])] = np.inf
+    if len(sizes) > 2:
+        rounding = POSITION_ROUNDING * (peaks[1] + peaks[0] / steps.min())
+        found[2:, high[1] - low[1] <= rounding] = np.inf
     return found
 
 
