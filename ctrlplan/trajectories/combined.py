@@ -463,5 +463,5 @@ def join_slack(*parts: Trajectory) -> Array:
     extrema = [part.extrema() for part in parts]
     ranges = np.max([e.maximum - e.minimum for e in extrema], axis=0)
     size = np.max([np.maximum(np.abs(e.minimum), np.abs(e.maximum)) for e in extrema], axis=0)
-    slack: Array = 1e-9 * ranges + POSITION_ROUNDING * size
+    slack: Array = 1e-9 * ranges + 0.5 * POSITION_ROUNDING * size  # ends have fewer errors than inner breakpoints
     return slack

@@ -2,10 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from repetitions import examples
+from scipy.interpolate import CubicSpline, PPoly
 
 import ctrlplan as cp
 
@@ -95,3 +97,86 @@ def test_rounding_is_relative_to_the_peak_of_the_derivative(factor):
 def test_order_must_be_a_count(order):
     with pytest.raises((ValueError, TypeError), match="order"):
         quintic(0.0, 1.0).jumps(order)
+
+
+def of_samples(times, rows, continuity=None):
+    if continuity is None:
+        return cp.as_trajectory(CubicSpline(times, np.transpose(rows)))
+    return cp.fit(times, rows, continuity=continuity)
+
+
+@pytest.mark.parametrize("length", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("size", [1e-9, 1.0, 1e9])
+@pytest.mark.parametrize("continuity", [None, 1, 2, 3, 4])
+def test_rounding_of_a_fitted_constant_or_line_does_not_jump(continuity, size, length):
+    """The derivatives of a constant are of the order eps y/h^k, with differences as large."""
+    x = np.linspace(0.0, 1.0, 157)
+    rows = size * np.array([np.cos(9.0 * x), np.full(x.size, 0.37), 2.0 + 0.7 * x])
+    plan = of_samples(length * x, rows, continuity)
+    order = 2 if continuity is None else continuity
+    found = [j for j in plan.jumps(order) if j.label != "y1" or plan.start < j.time < plan.end]
+    assert {j.label for j in found if j.order == 1} == {"y3"}  # at both ends
+    assert {(j.label, j.time) for j in found} == {("y3", plan.start), ("y3", plan.end)}
+    assert {j.order for j in found} == {1}
+
+
+@given(st.integers(0, 2**32 - 1))
+@examples(40)
+def test_smooth_fits_do_not_jump_inside(seed):
+    rng = np.random.default_rng(seed)
+    count, continuity = int(rng.integers(8, 300)), int(rng.integers(1, 5))
+    times = np.cumsum(rng.uniform(0.3, 1.0, count))
+    offset = 10.0 ** rng.uniform(-6.0, 6.0)
+    rows = [offset + np.sin(times), np.full(count, offset), offset * (1.0 + times)]
+    plan = cp.fit(times, rows, continuity=continuity)
+    assert [j for j in plan.jumps(continuity) if plan.start < j.time < plan.end] == []
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+@pytest.mark.parametrize("offset", [0.0, 11.0])
+@pytest.mark.parametrize("duration", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("size", [1e-9, 1.0, 1e9])
+def test_small_true_jumps_are_found_at_all_scales(size, duration, offset, order):
+    state = [1.0 + offset, 0.8, -2.5, 4.0, 6.0]
+    before = cp.PolySpline([cp.Waypoint(0.0, offset, 0, 0, 0, 0), cp.Waypoint(1.0, *state)])
+    jump = 1e-8 * float(before.peak(order)[0])
+    state[order] += jump
+    after = cp.PolySpline([cp.Waypoint(1.0, *state), cp.Waypoint(2.0, offset, 0, 0, 0, 0)])
+    plan = (size * before.then(after)).retime(2.0 * duration)
+    (found,) = (j for j in plan.jumps(order) if plan.start < j.time < plan.end)
+    assert (found.order, found.time) == (order, pytest.approx(duration))
+    # The evaluation of both sides has rounding, relative to the size of the derivative.
+    assert found.size == pytest.approx(size * jump / duration**order, rel=0.02)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_small_true_jumps_are_found_in_plans_of_many_segments(order):
+    """Coefficients given exactly: jumps of 1e-6 of the peak, of segments of 1e-4 of the duration."""
+    count, at = 10_000, 6_000
+    breakpoints = np.linspace(0.0, 1.0, count + 1)
+    jets = np.array([np.sin(3.0 * breakpoints[:-1] + k * np.pi / 2) * 3.0**k / math.factorial(k) for k in range(8)])
+    added = 1e-6 * 3.0**order
+    s = breakpoints[at:-1] - breakpoints[at]
+    for k in range(order + 1):
+        jets[k, at:] += added * s ** (order - k) / math.factorial(order - k) / math.factorial(k)
+    plan = cp.as_trajectory(PPoly(jets[::-1, :, None], breakpoints))
+    found = [j for j in plan.jumps(order) if plan.start < j.time < plan.end]
+    assert [(j.order, j.time) for j in found] == [(order, breakpoints[at])]
+    assert found[0].size == pytest.approx(added, rel=1e-4)
+
+
+def test_true_jumps_of_an_axis_at_breakpoints_of_others_are_found():
+    """Breakpoints of other axes that are nearly the same make short segments, which are no reason for rounding."""
+    axes = [quintic(0.0, 1.0, last=(1.0, 0.5, 0.25)).then(quintic(1.0, 3.0, (1.0, 0.5, 0.25 + 1e-6), (4.0, 0.0, 0.0)))]
+    axes += [
+        quintic(0.0, time, last=(2.0, 0.0, 0.0)).then(quintic(time, 3.0, (2.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
+        for time in (1.0 + 1e-9, 1.0 - 3e-12)
+    ]
+    found = [j for j in cp.stack(axes, labels=["y", "z1", "z2"]).jumps(2) if j.order == 2 and 0.0 < j.time < 3.0]
+    assert [(j.label, j.time) for j in found] == [("y", 1.0)]
+
+
+def test_a_step_beyond_the_rounding_of_a_distant_position_is_found():
+    assert quintic(0.0, 1.0, (1e6, 0.0, 0.0), (1e6 + 1.0, 0.0, 0.0)).jumps(2) == ()
+    found = cp.Step(1e6 + 1e-7, 1e6).jumps(2)
+    assert [(j.order, j.time, j.size) for j in found] == [(0, 0.0, pytest.approx(1e-7, rel=1e-2))]
