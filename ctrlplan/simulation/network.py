@@ -290,8 +290,8 @@ class Network:
         return [_product(self.wire[rows]) for rows in self.inputs]
 
     @cached_property
-    def held_outputs(self) -> NDArray[np.intp]:
-        """Indices of the outputs of the system that are constant between the sample times of discrete blocks.
+    def held(self) -> NDArray[np.bool_]:
+        """Which signals are constant between the sample times of discrete blocks, and these times after delays.
 
         They depend on what these blocks hold only, through blocks without states and delays if there are any.
         """
@@ -304,7 +304,16 @@ class Network:
             for block, rows, place in zip(self.blocks, self.inputs, self.outputs, strict=True):
                 if block.passes_steps and not held[place].all() and not self.wire[rows][:, ~held].any():
                     held[place], changed = True, True
-        return np.flatnonzero(~self.read[:, ~held].any(axis=1) & self.read.any(axis=1))
+        return held
+
+    @cached_property
+    def held_outputs(self) -> NDArray[np.intp]:
+        """Indices of the outputs of the system that depend on held signals only."""
+        return np.flatnonzero(~self.read[:, ~self.held].any(axis=1) & self.read.any(axis=1))
+
+    def is_held(self, i: int) -> bool:
+        """Whether all inputs of a block are held signals."""
+        return not self.wire[self.inputs[i]][:, ~self.held].any()
 
     @cached_property
     def to_outputs(self) -> Callable[[Array], Array]:

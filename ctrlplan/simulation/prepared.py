@@ -23,11 +23,11 @@ from ctrlplan.simulation.built_forms import (
     NotCompiledError,
     built_once,
 )
+from ctrlplan.simulation.delayed_signals import DelayedSignal, HeldDelaySignal
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Block, Network, UnsupportedError, structure
 from ctrlplan.simulation.sampled_form import DelayedForm, SampledForm, delayed_form, sampled_form
-from ctrlplan.simulation.segments import DelayedSignal
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, TimeSignals, signal_values
 from ctrlplan.simulation.starts import command_starts
 from ctrlplan.simulation.unread import is_read
@@ -163,12 +163,13 @@ class Prepared(Displayed):
 
     def _signals_in_order(self, inputs: Sequence[TimeSignal], first: float) -> list[TimeSignal]:
         sources, found = iter(self._sources), list(inputs)
-        for block in self._blocks():
+        for i, block in enumerate(self._blocks()):
             if block.plan is not None:
                 found.append(next(sources))
-            elif block.delay is not None:
+            elif block.delay is not None and self.network is not None:
+                kind = HeldDelaySignal if self.network.is_held(i) else DelayedSignal
                 initial = np.broadcast_to(np.asarray(block.traits.initial, dtype=float), (block.system.ninputs,))
-                found.append(DelayedSignal(block.delay, initial, first))
+                found.append(kind(block.delay, initial, first))
         return [*found, *sources]
 
     def compiled(

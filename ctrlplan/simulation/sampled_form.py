@@ -504,9 +504,9 @@ class _Delays:
         if follows:
             self._latches(i, _wide(self._from[i][0], self._size), from_w, initial)
         else:
-            held = np.zeros((width, self._size))
-            for timing in sorted({part.timing for part in self._parts}):
-                places = np.concatenate([part.held for part in self._parts if part.timing == timing])
+            held, feeding = np.zeros((width, self._size)), tuple(self._parts)  # without the registers of this delay
+            for timing in sorted({part.timing for part in feeding}):
+                places = np.concatenate([part.held for part in feeding if part.timing == timing])
                 own = np.zeros_like(from_z)
                 own[:, places] = from_z[:, places]
                 if own.any():

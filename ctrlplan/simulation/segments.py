@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.simulation.budget import check
+from ctrlplan.simulation.delayed_signals import DelayedSignal, HeldDelaySignal
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.network import Block, Network
 from ctrlplan.simulation.scales import in_turn
@@ -81,69 +82,6 @@ class Solver(Protocol):
 
     def outputs(self, times: Array, states: Array, time_values: Array) -> Array:
         """Outputs (noutputs, ntime) of the network."""
-
-
-class DelayedSignal:
-    """Delayed signals, stored as Chebyshev series by segments."""
-
-    def __init__(self, delay: float, initial: Array, first: float) -> None:
-        self.delay, self.width = delay, initial.size
-        self.tolerance = 0.0
-        self._initial, self._first = initial, first
-        self._pieces: list[Series] = []
-        self._ends: list[float] = []
-
-    def record(self, piece: Series) -> None:
-        """Record the inputs of the delay over a segment."""
-        self._pieces.append(piece)
-        self._ends.append(piece.right)
-
-    @property
-    def length(self) -> int:
-        """Number of stored pieces."""
-        return len(self._pieces)
-
-    def shorten(self, length: int) -> None:
-        """Remove all but the first pieces."""
-        del self._pieces[length:], self._ends[length:]
-
-    def forget(self, now: float) -> None:
-        """Remove the pieces that are not read after a time."""
-        old = bisect_right(self._ends, now - self.delay - self.tolerance)
-        del self._pieces[:old], self._ends[:old]
-
-    def breakpoints_between(self, t0: float, t1: float) -> Array:
-        """None: segments end at the breakpoints of what is delayed, after the delay."""
-        return np.empty(0)
-
-    def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
-        """Stored values; segments end at their breakpoints."""
-        return self.at(origin + s)
-
-    def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
-        """Bounds of the stored signals."""
-        low, high = np.full(self.width, np.inf), np.full(self.width, -np.inf)
-        if left - self.delay < self._first:
-            low, high = self._initial, self._initial
-        for piece in self._pieces:
-            if piece.left < right - self.delay and piece.right > left - self.delay:
-                low, high = np.minimum(low, piece.low), np.maximum(high, piece.high)
-        return low, high
-
-    def ends(self, left: float, right: float) -> None:
-        """None: stored signals are not known to be straight lines."""
-
-    def at(self, times: Array) -> Array:
-        """Stored values."""
-        # A jump that arrives at a time is included, whatever the rounding of the times.
-        past = times - self.delay + self.tolerance
-        out = np.repeat(self._initial[:, None], times.size, axis=1)
-        which = np.array([bisect_right(self._ends, t) for t in past.tolist()])
-        for k in np.unique(which[past >= self._first]).tolist():
-            piece = self._pieces[min(k, len(self._pieces) - 1)]
-            rows = (which == k) & (past >= self._first)
-            out[:, rows] = piece.at(np.maximum(past[rows] - self.tolerance, piece.left))
-        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,17 +155,20 @@ def integrate(
         course.prolong(apart([first, *marks, last])[1:-1], first, last)
     memory, schedule, rounding = course.memory, course.schedule, course.rounding
     shortest, reach, longest = _lengths(network, memory.delays, last - first, stops_after is not None)
+    memory.check_held(schedule.tolerance)
     found, span, left = _Recorded(), list[Series](), first
     x = schedule.sample(equations, first, state)
     while left < last:
         check(left)  # CVODES is not interrupted within a segment, which has a maximum number of steps
+        schedule.add(memory.changes(left, x))
         right = schedule.following(left)
         if right - left <= reach * (1.0 + 1e-9):
             right = schedule.on(times, right)
         else:
             right = left + reach if stops_after is None else _reached(times, left, reach)
-        if memory.delays or not (span and span[-1].right >= right):
-            until, accuracy = (right, resolution) if memory.delays else (schedule.fixed_after(left), RESOLVED)
+        if memory.has_delays or not (span and span[-1].right >= right):
+            until = right if memory.has_delays else schedule.fixed_after(left)
+            accuracy = resolution if memory.delays else RESOLVED
             error = np.maximum(rounding, memory.rounding)
             span = time_signals.series(0.5 * (left + right), left, until, accuracy, error)
         series = next(s for s in span if left < s.right)
@@ -396,10 +337,12 @@ def _longest(network: Network, delays: list[float], duration: float) -> float:
 
 
 class _Memory:
-    """Stored inputs of the delays, segment by segment.
+    """Stored inputs of the delays: segment by segment, and change by change of those that sampled blocks hold.
 
     Attributes
     ----------
+    delays : list of float
+        Delays [s] of the signals that are stored segment by segment.
     rounding : ndarray, shape (nsignals,)
         Rounding errors of all time signals: so far, of the delayed ones; otherwise 0.
     jumps : list of float
@@ -407,8 +350,12 @@ class _Memory:
     """
 
     def __init__(self, network: Network, solver: Solver, time_signals: TimeSignals, resolution: float) -> None:
-        blocks = network.blocks_with("delay")
-        self._time_signals = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
+        late = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
+        pairs = list(zip(late, network.blocks_with("delay"), strict=True))
+        self._every, self._all_time_signals = late, time_signals
+        self._held = [(signal, network.fed[i]) for signal, i in pairs if isinstance(signal, HeldDelaySignal)]
+        self._time_signals = [signal for signal in late if not isinstance(signal, HeldDelaySignal)]
+        blocks = [i for signal, i in pairs if not isinstance(signal, HeldDelaySignal)]
         self._fed = [network.fed[i] for i in blocks]
         self._wires, self._time_rows = [network.wire[network.inputs[i]] for i in blocks], network.time_rows
         self._solver, self._resolution = solver, resolution
@@ -417,11 +364,30 @@ class _Memory:
         self._rows = [
             slice(end - signal.width, end)
             for signal, end in zip(time_signals, ends.tolist(), strict=True)
-            if isinstance(signal, DelayedSignal)
+            if isinstance(signal, DelayedSignal) and not isinstance(signal, HeldDelaySignal)
         ]
         self.rounding: Array = np.zeros(time_signals.width)
         self._ends: list[Array | None] = [None for _ in self._time_signals]
         self.jumps: list[float] = []
+
+    @property
+    def has_delays(self) -> bool:
+        """Whether functions of time become known during the run."""
+        return bool(self._every)
+
+    def check_held(self, tolerance: float) -> None:
+        """Raise if a delay of a held signal is not distinct from the rounding of times."""
+        shortest = min((signal.delay for signal, _ in self._held), default=np.inf)
+        if shortest < 4.0 * tolerance:
+            raise ValueError(f"a delay must exceed the rounding of times, {4.0 * tolerance:.2g} s, got {shortest:g} s")
+
+    def changes(self, left: float, state: Array) -> list[float]:
+        """Store the held inputs of delays after the samples at a time; return when those that changed arrive."""
+        if not self._held:
+            return []
+        t = np.array([left])
+        w = self._solver.signals(t, state[:, None], self._all_time_signals.at(t))
+        return [left + signal.delay for signal, fed in self._held if signal.changed(left, fed(w)[:, 0])]
 
     def grid(self, left: float, right: float, inside: Array) -> tuple[Array, NDArray[np.bool_] | slice]:
         """Times of a segment at which states are required, the last its end, and which of them are those inside."""
@@ -436,16 +402,16 @@ class _Memory:
 
     def lengths(self) -> list[int]:
         """Number of stored pieces of each delay."""
-        return [signal.length for signal in self._time_signals]
+        return [signal.length for signal in self._every]
 
     def shorten(self, lengths: list[int]) -> None:
         """Remove the pieces that were stored since."""
-        for signal, length in zip(self._time_signals, lengths, strict=True):
+        for signal, length in zip(self._every, lengths, strict=True):
             signal.shorten(length)
 
     def forget(self, now: float) -> None:
         """Remove what is not read after a time."""
-        for signal in self._time_signals:
+        for signal in self._every:
             signal.forget(now)
 
     def record(self, left: float, right: float, series: Series, grid: Array, states: Array) -> bool:
@@ -515,6 +481,11 @@ class _Schedule:
     def marks(self) -> list[float]:
         """Breakpoints, and the end of the run."""
         return self._fixed
+
+    @property
+    def tolerance(self) -> float:
+        """Difference of two times [s] up to which they are considered equal."""
+        return self._tolerance
 
     def following(self, t: float) -> float:
         """The next time after t."""

@@ -199,6 +199,35 @@ def test_a_measurement_that_comes_late(period, delay):
     assert np.abs(found.outputs[3] - shown).max() <= 1e-12
 
 
+@pytest.mark.parametrize(("method", "tolerance"), [("exact", 1e-13), ("python", 1e-8)])
+@pytest.mark.parametrize("parts", [2, 3])
+def test_a_delay_of_a_control_and_of_the_same_control_delayed(parts, method, tolerance):
+    """y' = -2 y + u(t - h) + u(t - 2 h), with a period of 2 h or 3 h: the recurrence over each h by hand."""
+    delay, count, target = 0.07, 12, -0.6
+    block = cp.sample_hold(
+        ct.ss([], [], [], [[0.8]], parts * delay, inputs="e", outputs="u", name="law"), parts * delay
+    )
+    blocks = [
+        block,
+        ct.ss(-2.0, 1.0, 1.0, 0.0, inputs="z", outputs="y", name="plant"),
+        cp.create_delay_iosystem(delay, inputs="u", outputs="v", name="first"),
+        ct.summing_junction(["u", "v"], "w", name="sum"),
+        cp.create_delay_iosystem(delay, inputs="w", outputs="z", name="second"),
+        ct.summing_junction(["r", "-y"], "e", name="error"),
+    ]
+    loop = ct.interconnect(blocks, inputs="r", outputs=["y", "z"])
+    times = delay * np.arange(parts * count)
+    y, held, expected = 0.4, [0.0, 0.0], []
+    for k in range(times.size):
+        held.append(0.8 * (target - y) if k % parts == 0 else held[-1])
+        z = held[k + 1] + held[k]
+        expected.append((y, z))
+        y = y * math.exp(-2.0 * delay) + z * (1.0 - math.exp(-2.0 * delay)) / 2.0
+    found = cp.simulate(loop, times, target, [0.0, 0.4], method=method)
+    assert found.method == method
+    assert worst(found.outputs, np.transpose(expected)) < tolerance
+
+
 def test_two_controls_and_a_plan_through_one_delay():
     """Controls of two rates and the plan in one sum, 0.24 s late; then 0.11 s more."""
     plan, planned = plan_and_oracle()
