@@ -16,7 +16,7 @@ from ctrlplan._checks import check_kind, checked_finite
 from ctrlplan._display import Displayed, Facts, Part, Table, counted, time_text
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.bounds import Bound
-from ctrlplan.planning.naming import Naming
+from ctrlplan.planning.naming import Naming, check_times
 from ctrlplan.planning.path_law.positions import maximum_excess
 from ctrlplan.planning.quantities import (
     Response,
@@ -348,6 +348,8 @@ class Limited:
         self._local = [k for k, bound in enumerate(self.bounds) if not bound.in_loop]
         self.order = max((self.bounds[k].order for k in self._local), default=0)
         self.derivatives_only = all(bound.axis is not None for bound in self.bounds)
+        if self._quantities is not None and self._quantities is system and not self.derivatives_only:
+            check_times(self._quantities, plan, self.order)
         self.is_constant = all(bound.is_constant and not bound.in_loop for bound in self.bounds)
         self.bounds = tuple(self._scaled(bound) for bound in self.bounds)
         self.bounds = tuple(self._slackened(plan))
