@@ -486,6 +486,11 @@ class Bound:
         return replace(self, low=float(low[0]), high=float(high[0]))
 
 
+def changes(bound: Bound) -> tuple[float, ...]:
+    """Times [s] of the given plan at which limits begin, end or have a kink."""
+    return (*(bound.interval or ()), *(bound.profile.times if bound.profile is not None else ()))
+
+
 def limit_words(limit: object, name: str = "velocity") -> str:
     """Description of a limit in any form that `margins` accepts, by axis for names of all axes, such as velocity."""
     if isinstance(limit, Region):

@@ -125,8 +125,15 @@ class PlansByDuration:
         """Samples of each part at relative times."""
         found = []
         for part in self._parts:
-            jet = self.limited.seen(part.plan).jet(part.plan.start + fractions * part.plan.duration, self.limited.order)
-            found.append(Sampled(jet, fractions, np.full(fractions.size, 1.0 / fractions.size), part.plan.duration))
+            times, weights = (
+                part.plan.start + fractions * part.plan.duration,
+                np.full(fractions.size, 1 / fractions.size),
+            )
+            jet, moments = (
+                self.limited.seen(part.plan).jet(times, self.limited.order),
+                self.limited.moments(part.plan, times),
+            )
+            found.append(Sampled(jet, fractions, moments, weights, part.plan.duration))
         return found
 
     def _excesses_over_time(self, samples: list[Sampled], duration: float) -> Array:
@@ -147,7 +154,8 @@ class PlansByDuration:
             t = part.plan.start + fraction * part.plan.duration
             seen = self.limited.seen(part.plan)
             jet = np.stack([seen.jet(t, self.limited.order, left) for left in (False, True)], axis=-1)
-            samples.append(Sampled(jet, np.full(2, fraction), np.full(2, 0.5), part.plan.duration))
+            moments = self.limited.moments(part.plan, np.full(2, t))
+            samples.append(Sampled(jet, np.full(2, fraction), moments, np.full(2, 0.5), part.plan.duration))
         return lambda durations: self._excesses(samples, durations, [bound])
 
     @cached_property

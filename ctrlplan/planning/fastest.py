@@ -31,7 +31,7 @@ from ctrlplan.planning.peaks import excess_at_peaks
 from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, bottom, scan
 from ctrlplan.planning.time_law import with_fast_time_law
-from ctrlplan.trajectories import PathPlan, Retimed, Trajectory, WaypointSpline
+from ctrlplan.trajectories import PathPlan, PolySpline, Retimed, Trajectory, Waypoint, WaypointSpline
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.continuity import constant_axes
 from ctrlplan.trajectories.extrema import search_extrema
@@ -447,7 +447,8 @@ def _fastest_on_path(plan: Trajectory, limited: Limited, span: tuple[float, floa
         limited.check_smooth(plan)
         return _fastest_between_stops(plan, limited, span)
     by_derivatives = limited.derivatives_only and limited.order <= 3 and not signed
-    limited.check_constant('limits with hold="path"', over_time=by_derivatives)
+    passing = not any(_is_signed(bound) and not bound.is_constant for bound in limited.bounds)
+    limited.check_constant('limits with hold="path"', over_time=passing)
     if by_derivatives and limited.order <= 2:
         found = _fastest_by_derivatives(plan, limited, span, ends)
         return replace(found, stops=_stops(plan, limited, ends))
@@ -494,13 +495,14 @@ def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, f
     """Plan of short duration on its path, under limits of any signals."""
     # The values of the time law are times: relative to the start they have full precision.
     start, law = plan.start, None
+    on_path = limited if limited.is_constant else limited.at_positions()
     if limited.order <= HIGHEST:
         _check_rest(plan, limited)
         _check_signs(plan, limited, given=False)
         _closed_form(plan, limited, 1)  # raises for a direction in which no velocity is allowed
         for other in fast_laws_of_signals(plan.shift(-start), limited, start):
             try:
-                found = _at_its_limit(other.shift(start), limited) if span is None else None
+                found = _at_its_limit(other.shift(start), on_path) if span is None else None
             except RuntimeError:  # a quantity is not resolved where derivatives of the law multiply rounding
                 continue
             if found is not None:
@@ -519,7 +521,7 @@ def _fastest_by_signals(plan: Trajectory, limited: Limited, span: tuple[float, f
     uniform = fastest_within(plan, limited, span)
     if limited.order > HIGHEST:
         law = with_fast_time_law(uniform.plan.shift(-start), limited)
-    retimed = uniform if law is None else fastest_within(law.shift(start), limited, span)
+    retimed = uniform if law is None else fastest_within(law.shift(start), on_path, span)
     if retimed is uniform and limited.order <= HIGHEST:
         return replace(uniform, hold="path", statement=_GIVEN)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold="path")
@@ -540,10 +542,13 @@ def _with_given_speeds(plan: Trajectory, limited: Limited, span: tuple[float, fl
     def law(reserve: float) -> Trajectory:
         found = law_with_given_ends(begun, limited, plan.start, reserve)
         statements.append(_GIVEN if found is begun else _LOCAL)
+        if found is begun and not limited.is_constant:  # limits apply at values of a law
+            found = Retimed(begun, PolySpline([Waypoint(0.0, 0.0), Waypoint(begun.end, begun.end)]))
         return found.shift(plan.start)
 
-    found, margins = _with_reserves(plan, limited, span, law)
-    return Fastest(found, margins, ((found.duration, found.duration),), "path", limited, statement=statements[-1])
+    on_path = limited if limited.is_constant else limited.at_positions()
+    found, margins = _with_reserves(plan, on_path, span, law)
+    return Fastest(found, margins, ((found.duration, found.duration),), "path", on_path, statement=statements[-1])
 
 
 def _check_waypoints(plan: WaypointSpline, limited: Limited) -> None:
@@ -881,8 +886,10 @@ def _at_its_limit(plan: Trajectory, limited: Limited) -> Fastest | None:
         jet = np.stack([plan.jet(active.time, limited.order, left=left) for left in (True, False)], axis=-1)
         powers = -np.arange(float(len(jet)))[:, None, None]
 
-        def excess(factor: float, jet: Array = jet, powers: Array = powers, row: int = row) -> float:
-            return float(limited.bounds[row].excess(limited.values(jet * factor**powers)[row]).max())
+        def excess(
+            factor: float, jet: Array = jet, powers: Array = powers, row: int = row, own: Bound = active.bound
+        ) -> float:
+            return float(own.excess(limited.values(jet * factor**powers)[row]).max())
 
         factor = _nearest_root(excess)
         if factor is None or factor * plan.duration > longest:

@@ -15,8 +15,8 @@ import numpy as np
 from ctrlplan._checks import check_kind, checked_finite
 from ctrlplan._display import Displayed, Facts, Part, Table, counted, time_text
 from ctrlplan._renamed import FormerAttribute
-from ctrlplan.planning.bounds import Bound
-from ctrlplan.planning.naming import Naming
+from ctrlplan.planning.bounds import Bound, changes
+from ctrlplan.planning.naming import Naming, check_times
 from ctrlplan.planning.path_law.positions import maximum_excess
 from ctrlplan.planning.quantities import (
     Response,
@@ -298,6 +298,8 @@ class Sampled:
         Jet at the samples.
     fractions : ndarray, shape (ntime,)
         Times relative to the duration, 0 at the start.
+    moments : ndarray, shape (ntime,)
+        Times [s] of the plan for which limits are given.
     weights : ndarray, shape (ntime,)
         Weights of a mean over the plan.
     duration : float
@@ -306,6 +308,7 @@ class Sampled:
 
     jet: Array
     fractions: Array
+    moments: Array
     weights: Array
     duration: float
 
@@ -348,6 +351,8 @@ class Limited:
         self._local = [k for k, bound in enumerate(self.bounds) if not bound.in_loop]
         self.order = max((self.bounds[k].order for k in self._local), default=0)
         self.derivatives_only = all(bound.axis is not None for bound in self.bounds)
+        if self._quantities is not None and self._quantities is system and not self.derivatives_only:
+            check_times(self._quantities, plan, self.order)
         self.is_constant = all(bound.is_constant and not bound.in_loop for bound in self.bounds)
         self.bounds = tuple(self._scaled(bound) for bound in self.bounds)
         self.bounds = tuple(self._slackened(plan))
@@ -425,8 +430,9 @@ class Limited:
         simpson = np.where(np.arange(1, _SAMPLES - 1) % 2, 4.0, 2.0) / (3.0 * (_SAMPLES - 1))
         ends = lengths / (3.0 * (_SAMPLES - 1))
         weights = np.concatenate([ends, ends, (lengths[:, None] * simpson).ravel()]) / plan.duration
-        fractions = (np.concatenate([edges[1:], edges[:-1], times]) - plan.start) / plan.duration
-        return Sampled(np.concatenate(jet, axis=2), fractions, weights, plan.duration)
+        times = np.concatenate([edges[1:], edges[:-1], times])
+        fractions = (times - plan.start) / plan.duration
+        return Sampled(np.concatenate(jet, axis=2), fractions, self.moments(plan, times), weights, plan.duration)
 
     def values(self, jet: Array, chosen: Sequence[int] | None = None) -> Array:
         """Limited signals (nbounds, ntime) of a jet (order + 1, naxes, ntime); 0 for those not chosen or of a loop."""
@@ -491,7 +497,7 @@ class Limited:
 
     def excesses(self, plan: Trajectory, samples: Sampled) -> Array:
         """Excess (nbounds,) over each limit: over samples, and of signals of a loop by its response."""
-        values, times = self.values(samples.jet), self._start + self._duration * samples.fractions
+        values, times = self.values(samples.jet), samples.moments
         found = np.empty(len(self.bounds))
         for k in self._local:
             found[k] = self._excess_of(self.bounds[k], values[k], times, samples)
@@ -539,7 +545,7 @@ class Limited:
             half = durations.size // 2
             parts = ((jets[:, :, k], durations[k]) for k in (slice(0, half), slice(half, None)))
             return np.concatenate([self.excesses_of(part, samples, own, chosen) for part, own in parts])
-        times = self._start + self._duration * samples.fractions
+        times = samples.moments
         found = [
             [
                 self._excess_of(
@@ -583,10 +589,21 @@ class Limited:
 
     def sides(self, bound: Bound, plan: Trajectory, times: Array) -> tuple[Array, Array]:
         """Minimum and maximum (ntime,) of a signal at times of a plan; infinite where no limit applies."""
+        return bound.sides(self.moments(plan, times))
+
+    def moments(self, plan: Trajectory, times: Array) -> Array:
+        """Times (ntime,) [s] of the given plan, at which its limits apply, by those of another plan."""
         if self._at_positions and isinstance(plan, Retimed):
-            moments = np.clip(plan.law(times), plan.plan.start, plan.plan.end)
-            return bound.sides(self._start + moments - plan.plan.start)
-        return bound.sides(self._start + (times - plan.start) * self._duration / plan.duration)
+            own, times = plan.plan, np.clip(plan.law(times), plan.plan.start, plan.plan.end)
+        else:
+            own = plan
+        found: Array = self._start + (times - own.start) * (self._duration / own.duration)
+        return found
+
+    def changes(self, plan: Trajectory) -> list[float]:
+        """Times [s] of a plan of the given time law at which limits begin, end or have a kink."""
+        rate = plan.duration / self._duration
+        return [plan.start + (time - self._start) * rate for bound in self.bounds for time in changes(bound)]
 
     def rejection(self, plan: Trajectory) -> str:
         """Reason for which a plan is infeasible for the plant; empty if it is feasible."""
@@ -667,10 +684,7 @@ class Limited:
         """Margin to limits that apply in an interval or change with time."""
         b = self.bounds[k]
         if self._at_positions and isinstance(plan, Retimed):
-            sizes, times = maximum_excess(b, plan, self._start)
-            side = int(sizes.argmax())
-            moment = self._start + float(plan.law(float(times[side]))) - plan.plan.start
-            return _margin_at(b, moment, float(times[side]), side, float(sizes[side]))
+            return self._margin_at_positions(plan, k)
         rate = self._duration / plan.duration
         span = self._interval(b, plan)
         own = (self._start + (span[0] - plan.start) * rate, rate)
@@ -678,6 +692,27 @@ class Limited:
         part = window(plan, span, own, table)
         if b.profile is None and b.axis is not None:
             return _axis_margin(b, part.extrema(b.order))
+        return self._margin_in_window(part, k)
+
+    def _margin_at_positions(self, plan: Retimed, k: int) -> Margin:
+        """The same at positions of the given plan, for a plan with another time law."""
+        b, given = self.bounds[k], plan.plan
+        rate = self._duration / given.duration
+        if b.axis is not None:
+            sizes, times = maximum_excess(b, plan, self._start, rate)
+            side = int(sizes.argmax())
+            time = float(times[side])
+            return _margin_at(b, float(self.moments(plan, np.array([time]))[0]), time, side, float(sizes[side]))
+        first, last = b.interval or (self._start, self._start + self._duration)
+        marks = [first, last, *(b.profile.times if b.profile is not None else ())]
+        places = np.clip(given.start + (np.array(marks) - self._start) / rate, given.start, given.end)
+        begin, end, *table = plan.times_at(places).tolist()
+        clock = (self._start - given.start * rate, rate)
+        return self._margin_in_window(window(plan, (begin, end), clock, table, plan.law), k)
+
+    def _margin_in_window(self, part: Trajectory, k: int) -> Margin:
+        """Margin of a part of a plan whose last axis is the time of the given plan."""
+        b = self.bounds[k]
 
         def excess(jet: Array) -> Array:
             row = self._rows(jet[:, :-1], [k])[k]
@@ -687,7 +722,8 @@ class Limited:
         found = function_extrema(part, excess, self.order, 1.0)
         worst = int(found.maximum.argmax())
         time = float(found.time_max[worst])
-        return _margin_at(b, own[0] + (time - span[0]) * rate, time, worst, float(found.maximum[worst]))
+        moment = float(part.jet(time, 0, left=time > part.start)[0, -1])
+        return _margin_at(b, moment, time, worst, float(found.maximum[worst]))
 
     def _interval(self, bound: Bound, plan: Trajectory) -> tuple[float, float]:
         """Interval [s] of a plan in which limits apply, in the plan's time."""
@@ -800,7 +836,8 @@ class Limited:
     def at_rest(self, plan: Trajectory) -> Sampled:
         """Samples of the plan with zero derivatives; one sample if no limit depends on position or time."""
         if self.is_constant and all(b.axis is not None and b.order for b in self.bounds):
-            return Sampled(np.zeros((self.order + 1, plan.naxes, 1)), np.zeros(1), np.ones(1), plan.duration)
+            start = np.array([self._start])
+            return Sampled(np.zeros((self.order + 1, plan.naxes, 1)), np.zeros(1), start, np.ones(1), plan.duration)
         samples = self.sampled(plan)
         return replace(samples, jet=samples.jet * (np.arange(self.order + 1) == 0)[:, None, None])
 
@@ -809,7 +846,7 @@ class Limited:
         if all(bound.in_loop or bound.kind == "rms" or _of_motion(bound) for bound in self.bounds):
             return
         still = self.at_rest(plan)
-        times = self._start + self._duration * still.fractions
+        times = still.moments
         for k, values in enumerate(self.values(still.jet)):
             bound = self.bounds[k]
             if bound.in_loop or bound.kind == "rms" or _of_motion(bound):
@@ -870,7 +907,7 @@ class Limited:
         except ValueError:  # infeasible for the plant, but possibly feasible more slowly
             pass
         still = self.at_rest(plan)
-        times = self._start + self._duration * still.fractions
+        times = still.moments
         for bound, values in zip(self.bounds, self.values(still.jet), strict=True):
             if bound.in_loop:
                 sides = [abs(side) for side in (bound.low, bound.high) if math.isfinite(side)]

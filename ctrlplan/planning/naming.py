@@ -21,6 +21,10 @@ _HIGHEST = 8
 
 _FORMS = "a tuple (minimum, maximum) applies to every axis, a list of one number per axis gives magnitudes"
 
+_ARRAYS = (
+    "compute with arrays (ntime,), such as np.where(a > 0, a, b) instead of if, or np.sin(a) instead of math.sin(a)"
+)
+
 _BOTH = 'write {"plan": {...}, "loop": {...}}'
 
 
@@ -227,9 +231,26 @@ def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
     if not orders:
         raise ValueError(
             f"quantities must accept jets (order + 1, {plan.naxes}, ntime) of up to {_HIGHEST} derivatives, got "
-            f"{type(rejection).__name__}: {rejection}"
-        )
+            f"{type(rejection).__name__}: {rejection}{f'; {_ARRAYS}' if isinstance(rejection, TypeError) else ''}"
+        ) from rejection
     return orders
+
+
+def check_times(quantities: Quantities, plan: Trajectory, order: int) -> None:
+    """Raise for quantities that accept a jet of one time of a plan, but not one of the same time twice."""
+    jet = plan.jet(np.array([0.5 * (plan.breakpoints[0] + plan.breakpoints[1])]), order)
+    with np.errstate(all="ignore"):
+        try:
+            quantities(jet)
+        except ValueError:  # infeasible there
+            return
+        try:
+            quantities(np.repeat(jet, 2, axis=2))
+        except (ValueError, TypeError) as reason:
+            raise ValueError(
+                f"quantities must accept jets ({order + 1}, {plan.naxes}, ntime) of several times, got "
+                f"{type(reason).__name__}: {reason}; {_ARRAYS}"
+            ) from reason
 
 
 def _accepted(quantities: Quantities, jet: Array) -> tuple[dict[str, int], Exception | None]:
@@ -240,7 +261,7 @@ def _accepted(quantities: Quantities, jet: Array) -> tuple[dict[str, int], Excep
         try:
             with np.errstate(all="ignore"):
                 found = quantities(jet[: order + 1])
-        except (ValueError, IndexError, KeyError) as reason:  # it depends on higher orders
+        except (ValueError, IndexError, KeyError, TypeError) as reason:  # it depends on higher orders
             rejection = reason
             continue
         if not isinstance(found, Mapping):

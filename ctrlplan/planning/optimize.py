@@ -146,7 +146,8 @@ def optimize_waypoints(
     free_times : bool, optional
         Optimise the times of inner waypoints as well. Prescribed derivatives are
         preserved, and no segment becomes shorter than 1e-4 of the mean duration
-        or half the shortest given one. The result is the best of several local
+        or half the shortest given one, or so short that the cost is not resolved
+        in double precision. The result is the best of several local
         minima, at least as good as the given times.
     weights : array_like, shape (naxes,), optional
         Weights of the axes in the cost, above 0.
@@ -209,7 +210,7 @@ def optimize_waypoints(
     found = problem.solve(relative)
     cost = _cost(found, factors, duration, derivative)
     if free_times and len(points) > 2:
-        chosen = start + duration * _times(_best_durations(problem, relative, found, factors))
+        chosen = start + duration * _times(_resolved_durations(problem, relative, found, factors))
         chosen[[0, -1]] = times[[0, -1]]
         better = problem.solve(np.diff(chosen) / duration)
         if better.cost @ factors < found.cost @ factors:
@@ -594,13 +595,28 @@ def _norms(matrix: Array) -> Array:
     return np.where(norms > 0.0, norms, 1.0)
 
 
-def _best_durations(problem: _Problem, given: Array, first: _Solution, weights: Array) -> Array:
-    """Relative durations of minimum cost from several starts."""
+def _resolved_durations(problem: _Problem, given: Array, first: _Solution, weights: Array) -> Array:
+    """Relative durations of minimum cost, of those whose cost is resolved: the given ones, or longer segments."""
+    allowed = min(max(_FEW, _relative_error(problem, given, first)), _NONE)
+    longest = 0.5 * float(given.min())
+    minimum = min(1e-4 / given.size, longest)
+    while True:
+        found = _best_durations(problem, given, first, weights, minimum)
+        if problem.is_minimal() and problem.has_digits(found):
+            return found
+        if _relative_error(problem, found, problem.solve(found)) <= allowed:
+            return found
+        if minimum >= longest:
+            return given
+        minimum = min(2.0 * float(found.min()), longest)
+
+
+def _best_durations(problem: _Problem, given: Array, first: _Solution, weights: Array, minimum: float) -> Array:
+    """Relative durations of minimum cost from several starts, none below a minimum."""
     # Costs below this are rounding, of which the logarithm has no meaning.
     floor = 1e-26 * float(problem.scale(given) @ weights)
     if first.cost @ weights <= floor:
         return given
-    minimum = min(1e-4 / given.size, 0.5 * float(given.min()))
     room = 1.0 - given.size * minimum
     chord = np.sqrt(weights @ np.diff(first.sides[1][:, 0]) ** 2)
     chord = chord / chord.max() if chord.any() else np.ones(given.size)

@@ -17,6 +17,9 @@ _SHARES = readonly(np.asarray(0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 25)), d
 _WITHIN = 2e-3
 """Distance from the maximum excess within which another peak may be the maximum at a duration nearby."""
 
+_FAR = 1e3
+"""Distance from limits, in their scale, where none applies."""
+
 _PARTS, _ROUNDS = 16, 3
 """Number of parts of an interval about a peak, and how often the parts next to the highest value are divided."""
 
@@ -39,15 +42,20 @@ def excess_at_peaks(plan: Trajectory, limited: Limited) -> Callable[[float], flo
         If the plan is infeasible for the plant; by the function as well.
     """
     bounds, segments, times = _peaks(plan, limited)
-    jet = plan.segments_jet(segments, times, limited.order)
+    jet, moments = plan.segments_jet(segments, times, limited.order), _moments(plan, limited, segments, times)
     powers = -np.arange(float(len(jet)))[:, None, None]
     chosen = [(limited.bounds[k], k, bounds == k) for k in np.unique(bounds).tolist()]
 
     def excess(factor: float) -> float:
         values = limited.values(jet * factor**powers)
-        return max(float(bound.excess(values[k, own]).max()) for bound, k, own in chosen)
+        return max(float(bound.excess(values[k, own], moments[own]).max()) for bound, k, own in chosen)
 
     return excess
+
+
+def _moments(plan: Trajectory, limited: Limited, segments: NDArray[np.intp], times: Array) -> Array:
+    """Times (ntime,) [s] of the given plan; not evaluated for limits that do not depend on them."""
+    return times if limited.is_constant else limited.moments(plan, plan.breakpoints[segments] + times)
 
 
 def _peaks(plan: Trajectory, limited: Limited) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
@@ -55,9 +63,12 @@ def _peaks(plan: Trajectory, limited: Limited) -> tuple[NDArray[np.intp], NDArra
 
     def excesses(segments: NDArray[np.intp], times: Array) -> Array:
         """Excess (nbounds, nrows, ntimes) at times (nrows, ntimes) in segments (nrows,)."""
-        jet = plan.segments_jet(segments.repeat(times.shape[1]), times.ravel(), limited.order)
-        rows = [bound.excess(row) for bound, row in zip(limited.bounds, limited.values(jet), strict=True)]
-        return np.array(rows).reshape(-1, *times.shape)
+        own = segments.repeat(times.shape[1])
+        values = limited.values(plan.segments_jet(own, times.ravel(), limited.order))
+        moments = _moments(plan, limited, own, times.ravel())
+        rows = [bound.excess(row, moments) for bound, row in zip(limited.bounds, values, strict=True)]
+        found: Array = np.maximum(rows, -_FAR).reshape(-1, *times.shape)
+        return found
 
     times = np.diff(plan.breakpoints)[:, None] * _SHARES
     values = excesses(np.arange(len(times)), times)
@@ -74,6 +85,7 @@ def _peaks(plan: Trajectory, limited: Limited) -> tuple[NDArray[np.intp], NDArra
         left, right = inner[peaks, k - 1], inner[peaks, k + 1]
         below, here, above = (own[peaks, k + i] for i in (-1, 0, 1))
         curve = np.minimum(below - 2.0 * here + above, -np.finfo(float).tiny)
-        move = np.clip(0.5 * (below - above) / curve, -1.0, 1.0)  # to the vertex of a parabola
+        with np.errstate(over="ignore"):
+            move = np.clip(0.5 * (below - above) / curve, -1.0, 1.0)  # to the vertex of a parabola
         vertices = inner[peaks, k] + 0.5 * move * (right - left)
     return bounds, segments, vertices

@@ -138,8 +138,10 @@ class _Law:
             values = self._limited.values(series * FACTORIALS[: order + 1, None, None])
         except ValueError:  # infeasible for the plant: far beyond every limit
             return np.full((2 * len(self._bounds) * _SAMPLES, logs.shape[1]), -1e3)
-        rows = [(b.high - row) / b.scale + b.slack for b, row in zip(self._bounds, values[self._moving], strict=True)]
-        rows += [(row - b.low) / b.scale + b.slack for b, row in zip(self._bounds, values[self._moving], strict=True)]
+        sides = [self._limited.sides(b, self._plan, times) for b in self._bounds]
+        own = list(zip(self._bounds, values[self._moving], sides, strict=True))
+        rows = [(high - row) / b.scale + b.slack for b, row, (_, high) in own]
+        rows += [(row - low) / b.scale + b.slack for b, row, (low, _) in own]
         room = np.minimum(np.array(rows), 1e3)
         return room.reshape(len(rows) * _SAMPLES, logs.shape[1])
 

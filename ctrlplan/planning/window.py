@@ -29,14 +29,17 @@ class _Window(InternalTrajectory):
     interval : (float, float)
         First and last time [s], of the plan.
     own_time : (float, float)
-        Time of the other plan at the first time, and its rate.
+        Time of the other plan at the first time, and its rate; with a law: at 0 of the law.
     times : sequence of float
         Further breakpoints, of the plan.
+    law : Trajectory or None
+        Time law of the plan.
     """
 
     what = "a part of a plan"
     plan: Trajectory
     own_time: tuple[float, float]
+    law: Trajectory | None
 
     def __init__(
         self,
@@ -44,6 +47,7 @@ class _Window(InternalTrajectory):
         interval: tuple[float, float],
         own_time: tuple[float, float],
         times: Sequence[float] = (),
+        law: Trajectory | None = None,
     ) -> None:
         first, last = interval
         inner = np.union1d(plan.breakpoints, times)
@@ -53,16 +57,21 @@ class _Window(InternalTrajectory):
             breakpoints=np.concatenate([[first], inner, [last]]),
             plan=plan,
             own_time=own_time,
+            law=law,
         )
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         left, right = self.breakpoints[segment : segment + 2].tolist()
         jet = self.plan.segment_jet_at(0.5 * (left + right), left, s, order)
-        clock = np.zeros((order + 1, 1, s.size))
         first, rate = self.own_time
-        clock[0] = first + rate * (left - self.start + s)
-        clock[1:2] = rate
+        if self.law is None:
+            clock = np.zeros((order + 1, 1, s.size))
+            clock[0] = first + rate * (left - self.start + s)
+            clock[1:2] = rate
+        else:
+            clock = rate * self.law.segment_jet_at(0.5 * (left + right), left, s, order)
+            clock[0] += first
         return np.concatenate([jet, clock], axis=1)
 
 
@@ -71,6 +80,7 @@ def window(
     interval: tuple[float, float],
     own_time: tuple[float, float],
     times: Sequence[float] = (),
+    law: Trajectory | None = None,
 ) -> Trajectory:
     """Part of a plan on an interval, with a further axis: the time of the given plan.
 
@@ -81,11 +91,13 @@ def window(
     interval : (float, float)
         First and last time [s], of the plan.
     own_time : (float, float)
-        Time of the given plan at the first time, and its rate.
+        Time of the given plan at the first time, and its rate; with a law: at 0 of the law.
     times : sequence of float, optional
         Further breakpoints.
+    law : Trajectory, optional
+        Time law of the plan, proportional to the time of the given plan; default: the time itself.
     """
-    return _Window(plan, interval, own_time, times)
+    return _Window(plan, interval, own_time, times, law)
 
 
 def mean_square(plan: Trajectory, function: Callable[[Array], Array], order: int) -> float:

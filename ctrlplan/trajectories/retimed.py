@@ -119,6 +119,12 @@ class Retimed(Trajectory):
             out[:, :, at_end] = _composed_jets(*jets)[low:]
         return out
 
+    def times_at(self, places: Array) -> Array:
+        """Times [s] at which the law reaches times [s] of the plan, those outside of it at its ends."""
+        values = self.law(self.law.breakpoints)
+        inside, slack = np.clip(places, values[0], values[-1]), _ROUNDING * float(values[-1] - values[0])
+        return np.array([_passing(self.law, values, place, slack) for place in inside.tolist()])
+
     @property
     def in_batches(self) -> bool:
         """Whether segments are evaluated together: many, or those of a law that are."""

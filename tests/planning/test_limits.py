@@ -517,3 +517,27 @@ def test_a_function_that_returns_nan_is_named_with_the_position():
     said = r"u must be determined by the plan, got nan .*at the position \(1\): .*, or the function returns nan"
     with pytest.raises(ValueError, match=said):
         cp.fastest(plan, {"u": 1.0}, lambda jet: {"u": np.where(jet[0, 0] > 0.5, np.nan, jet[1, 0])}, hold="path")
+
+
+@pytest.mark.parametrize(
+    "turning",
+    [
+        lambda jet: {"effort": jet[2, 0] if jet[2, 0] > 0 else -jet[2, 0]},
+        lambda jet: {"effort": max(jet[2, 0], -0.5 * jet[2, 0])},
+        lambda jet: {"effort": float(jet[2, 0])},
+    ],
+)
+@pytest.mark.parametrize("hold", ["shape", "waypoints", "path"])
+def test_quantities_of_one_time_only_are_rejected_with_the_way_on(turning, hold):
+    with pytest.raises(
+        ValueError, match=r"quantities must accept jets .*got (Value|Type)Error: .*; .*np\.where"
+    ) as info:
+        cp.fastest(MOVE, {"effort": 1.0}, turning, hold=hold)
+    assert isinstance(info.value.__cause__, ValueError | TypeError)
+    cp.fastest(MOVE, {"effort": 1.0}, lambda jet: {"effort": np.where(jet[2, 0] > 0, jet[2, 0], -jet[2, 0])})
+
+
+def test_quantities_keep_the_reason_of_a_rejected_jet():
+    with pytest.raises(ValueError, match="quantities must accept jets") as info:
+        margins(MOVE, {"effort": 1.0}, lambda jet: {"effort": jet[20, 0]})
+    assert isinstance(info.value.__cause__, IndexError)

@@ -883,3 +883,23 @@ def test_free_times_of_many_waypoints_lower_the_cost():
                 Waypoint(t + change * (k == i), *p.jet) for k, (t, p) in enumerate(zip(chosen, points, strict=True))
             ]
             assert optimize_waypoints(moved).cost > free.cost
+
+
+@pytest.mark.parametrize("height", [1.01, 1.003, 1.2])
+def test_free_times_of_one_spline_stay_where_the_cost_is_resolved(height):
+    points = [Waypoint(0, 0, 0, 0), Waypoint(1.2, 1), Waypoint(2.1, height), Waypoint(3.5, 2.2, 0, 0)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = optimize_waypoints(points, free_times=True, single=True)
+    plan, times = found.plan, [point.time for point in found.waypoints]
+    exact = quad(lambda t: plan(t, 3) ** 2, 0, 3.5, epsabs=0, epsrel=1e-12, points=times[1:-1])[0]
+    assert found.cost == pytest.approx(exact, rel=1e-6)
+    assert plan([times[1], times[2]]) == pytest.approx([1, height], abs=1e-9)
+    gap = times[2] - times[1]
+    costs = [
+        optimize_waypoints([points[0], Waypoint(t, 1), Waypoint(t + step, height), points[3]], single=True).cost
+        for step in gap * np.array([1.0, 1.5, 3.0, 10.0])
+        for t in np.linspace(0.2, 3.3 - step, 12)
+        if t + step < 3.3
+    ]
+    assert found.cost <= min(costs) * (1 + 1e-6)

@@ -15,11 +15,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.planning.bounds import Bound
+from ctrlplan.planning.bounds import Bound, changes
 from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.interior_point import Problem, minimum
-from ctrlplan.planning.path_law.law import changes, losses, problem_of
+from ctrlplan.planning.path_law.law import losses, problem_of
 from ctrlplan.planning.path_law.rows import POINTS, SMOOTH_POINTS, Activity
 from ctrlplan.planning.path_law.spans import Part, Rates, parts_of
 from ctrlplan.planning.path_law.sweep import check_ends

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ctrlplan.planning.bounds import Bound
+from ctrlplan.planning.bounds import Bound, changes
 from ctrlplan.planning.path_law.bernstein import bernstein
 from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.interior_point import Problem, minimum
@@ -75,11 +75,6 @@ def fastest_law(
             break
         grid = grid.divided(np.clip(np.ceil(loss / loss.mean()), 1, _PIECES).astype(int))
     return Retimed(plan, _law(plan, parts, grid, local))
-
-
-def changes(bound: Bound) -> tuple[float, ...]:
-    """Times [s] of the given plan at which limits begin, end or have a kink."""
-    return (*(bound.interval or ()), *(bound.profile.times if bound.profile is not None else ()))
 
 
 def problem_of(grid: Grid, spline: Spline, rows: Rows) -> Problem:

@@ -20,7 +20,7 @@ _INSIDE = 1e-9
 """Distance from the ends of a cell, relative to it, at which limits that jump there are evaluated."""
 
 
-def maximum_excess(bound: Bound, plan: Retimed, start: float) -> tuple[Array, Array]:
+def maximum_excess(bound: Bound, plan: Retimed, start: float, rate: float = 1.0) -> tuple[Array, Array]:
     """Maximum excess over the lower and the upper limit (2,) of a derivative, in their scale, and its times [s].
 
     Parameters
@@ -31,12 +31,14 @@ def maximum_excess(bound: Bound, plan: Retimed, start: float) -> tuple[Array, Ar
         The given plan, possibly shifted, with another time law.
     start : float
         Start [s] of the given plan.
+    rate : float, optional
+        Duration of the given plan relative to that of `plan` without the law.
     """
 
     def excess(values: Array, low: Array, high: Array) -> Array:
         return np.maximum(np.stack([low - values, values - high]) / bound.scale, -_FAR)
 
-    return _maxima(bound, plan, start, excess)
+    return _maxima(bound, plan, start, excess, rate)
 
 
 def required_rate(bound: Bound, plan: Retimed, start: float) -> tuple[float, float]:
@@ -63,6 +65,7 @@ class _Rows:
     plan: Retimed
     start: float
     function: Callable[[Array, Array, Array], Array]
+    rate: float
     naxes: int = 2
 
     @property
@@ -73,16 +76,16 @@ class _Rows:
         """Values (1, 2, ntime)."""
         first, last = self.breakpoints[segments], self.breakpoints[segments + 1]
         inside = first + np.clip(s / (last - first), _INSIDE, 1.0 - _INSIDE) * (last - first)
-        low, high = self.bound.sides(self.start + self.plan.law(inside) - self.plan.plan.start)
+        low, high = self.bound.sides(self.start + self.rate * (self.plan.law(inside) - self.plan.plan.start))
         values = self.plan.segments_jet(segments, s, self.bound.order)[self.bound.order, self.bound.axis or 0]
         return self.function(values, low, high)[None]
 
 
 def _maxima(
-    bound: Bound, plan: Retimed, start: float, function: Callable[[Array, Array, Array], Array]
+    bound: Bound, plan: Retimed, start: float, function: Callable[[Array, Array, Array], Array], rate: float = 1.0
 ) -> tuple[Array, Array]:
     """Maxima of two functions over a plan, and their times [s]."""
-    rows, durations = _Rows(bound, plan, start, function), np.diff(plan.breakpoints)
+    rows, durations = _Rows(bound, plan, start, function, rate), np.diff(plan.breakpoints)
     segments = np.arange(durations.size)
     ends = np.concatenate([rows.segments_jet(segments, share * durations, 0)[0] for share in (0.0, 1.0)], axis=1)
     inner, s = inner_extrema(rows, 0, ends.min(axis=1), ends.max(axis=1))

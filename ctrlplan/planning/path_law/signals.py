@@ -101,6 +101,9 @@ _SCALE, _BEYOND = 1e-4, 10.0
 _FAR = 1e6
 """Magnitude of a missing limit, in the scale of the other one."""
 
+_INSIDE = 1e-9
+"""Distance from the ends of a cell, relative to it, at which limits that jump there are evaluated."""
+
 HIGHEST = 5
 """Highest derivative of the plan on which signals may depend: the law has four continuous ones, the fifth jumps."""
 
@@ -170,7 +173,7 @@ class _Problems:
     @classmethod
     def of(cls, plan: Trajectory, limited: Limited, origin: float, given: Rates) -> _Problems:
         """Problems on the initial cells of a plan."""
-        parts = parts_of(plan, True, (), given, origin)
+        parts = parts_of(plan, True, limited.changes(plan), given, origin)
         return cls(parts, Grid.of(plan, [part for part in parts if part.moves]), limited)
 
     @property
@@ -265,7 +268,7 @@ class _Problems:
             retimed = Retimed(self._grid.plan, law)
         except ValueError:  # a law that does not increase between the ends of a cell
             return np.full(self._grid.length.size, _INFEASIBLE)
-        return self._between.excess(retimed.jet(times, self._limited.order))
+        return self._between.excess(retimed.jet(times, self._limited.order), law(times).reshape(-1, _CHECKS.size))
 
     def _converged(self, x: Array, reserves: Array, rounds: int = _ROUNDS) -> _Solution:
         """Local minimum near coefficients, with a distance (ncells,) from the limits in each cell.
@@ -330,13 +333,30 @@ class _Signals:
         strict = np.array([bound.axis is not None and bound.slack > 0.0 for bound in bounds])[:, None]
         slack = np.array([bound.slack + 2.0 * _RESERVE if bound.slack else 0.0 for bound in bounds])[:, None]
         slack = np.where(strict, np.where(self._at_rest(), _FAR, 0.0), slack)
-        low, high = (np.array([[getattr(bound, side)] for bound in bounds]) for side in ("low", "high"))
+        self._speeds = np.array([bound.order <= 1 for bound in bounds])[:, None] & self._at_given_speeds()
+        self.strict, self._slack = strict, slack
+        self._low, self._high = self._sides(grid.times(points).T)
         ramp = (grid.length / grid.length.max()).repeat(points.size)
-        self._low_share, self._high_share = (np.where(strict & (side == 0.0), ramp, 1.0) for side in (low, high))
-        self.strict = strict
-        speeds = np.array([bound.order <= 1 for bound in bounds])[:, None] & self._at_given_speeds()
-        self._low = np.where(speeds, -_FAR, np.maximum(low / self._scales, -_FAR) - slack)
-        self._high = np.where(speeds, _FAR, np.minimum(high / self._scales, _FAR) + slack)
+        self._low_share, self._high_share = (
+            np.where(strict & (side == 0.0), ramp, 1.0) for side in self._given_sides(grid.times(points).T)
+        )
+
+    def _given_sides(self, places: Array) -> tuple[Array, Array]:
+        """Limits (nbounds, npoints), in their scale, at times (ncells, npoints) [s] of the plan in all cells."""
+        grid = self._grid
+        begin, length = (grid.plan.breakpoints[grid.segment] + grid.start)[:, None], grid.length[:, None]
+        inside = np.clip(places, begin + _INSIDE * length, begin + (1.0 - _INSIDE) * length).ravel()
+        bounds = [self._limited.bounds[k] for k in self._moving]
+        low, high = np.array([self._limited.sides(bound, grid.plan, inside) for bound in bounds]).swapaxes(0, 1)
+        return low / self._scales, high / self._scales
+
+    def _sides(self, places: Array) -> tuple[Array, Array]:
+        """The same, finite and with slack where they are attained at rest."""
+        low, high = self._given_sides(places)
+        return (
+            np.where(self._speeds, -_FAR, np.maximum(low, -_FAR) - self._slack),
+            np.where(self._speeds, _FAR, np.minimum(high, _FAR) + self._slack),
+        )
 
     def _at_rest(self) -> NDArray[np.bool_]:
         """Points (npoints,) at which the plan is at rest."""
@@ -379,13 +399,17 @@ class _Signals:
         """Maximum violation at the points with half the reserve, in the scale of the limits."""
         return self._beyond(self._derivatives(local))
 
-    def excess(self, jet: Array) -> Array:
-        """Maximum violation in each cell (ncells,), in the scale of the limits, by the jets of a law at its points."""
+    def excess(self, jet: Array, places: Array) -> Array:
+        """Maximum violation in each cell (ncells,), in the scale of the limits, by the jets of a law at its points.
+
+        `places` (ncells, npoints) are the times [s] of the plan at which limits apply.
+        """
         try:
             values = self._limited.values(jet)[self._moving] / self._scales
         except ValueError:  # infeasible for the plant
             return np.full(self._grid.length.size, _INFEASIBLE)
-        beyond = np.concatenate([values - self._high, self._low - values])
+        low, high = (self._low, self._high) if self._limited.is_constant else self._sides(places)
+        beyond = np.concatenate([values - high, low - values])
         return _peaks(beyond.reshape(len(beyond), -1, self._points.size)).max(axis=0)
 
     def losses(self, local: Array) -> Array:
