@@ -26,6 +26,9 @@ _DEGREES = (1, 3, 3, 5, 5)
 _ROUNDING = 1e-9
 """Part of a tolerance for the rounding of the polynomials of a spline."""
 
+_ROUNDINGS = 6
+"""Part of a limit for the rounding of constants and values, in spacings of numbers as large as the samples."""
+
 _PARTS = 16
 """Maximum number of parts into which an interval between knots is divided in one step."""
 
@@ -45,7 +48,8 @@ def fit(
     By default the plan interpolates the samples (`scipy.interpolate.make_interp_spline`).
     With `tolerance` it is a least-squares spline (`make_lsq_spline`) whose knots, the
     same for all axes, are added where the deviation is larger. With `smoothing` it is,
-    axis by axis, the smoothing spline of FITPACK (`splrep`). Knots are sample times.
+    axis by axis, the smoothing spline of FITPACK (`splrep`) or, of continuity 0, a
+    least-squares spline with knots added until the sum is met. Knots are sample times.
 
     Parameters
     ----------
@@ -58,7 +62,7 @@ def fit(
     smoothing : float or array_like of shape (naxes,), optional
         Maximum sum of the squared deviations of an axis, as the argument `s` of
         `splrep`: about the number of samples times the variance of their noise.
-        0 interpolates.
+        0 interpolates, up to rounding.
     continuity : int, optional
         Highest derivative that is continuous, from 0 (linear between samples) to 4.
     labels : sequence of str, optional
@@ -69,7 +73,8 @@ def fit(
     Returns
     -------
     PiecewisePolynomial
-        Its attribute `deviation` is the maximum deviation at the samples, by axis.
+        Its attribute `deviation` is the maximum deviation of its values at the samples,
+        by axis, rounding included.
         Peaks and extrema of its derivatives are those of the polynomials, between
         the samples too.
 
@@ -80,7 +85,8 @@ def fit(
     ValueError
         If shapes differ, a sample is not finite, times do not increase strictly, or
         there are too few samples for the continuity; if `tolerance` and `smoothing`
-        are both given; if the tolerance would require more knots than samples.
+        are both given; if the tolerance would require more knots than samples, or
+        rounding leaves more than `tolerance` or `smoothing` allows.
 
     Warns
     -----
@@ -110,39 +116,75 @@ def fit(
         raise ValueError(f"tolerance and smoothing must not both be given, got {tolerance!r:.40} and {smoothing!r:.40}")
     allowed = _checked_positive(tolerance, "tolerance", len(rows), zero=False)
     sums = _checked_positive(smoothing, "smoothing", len(rows), zero=True)
+    middle = _middle(rows)
+    centred = rows - middle[:, None]
     if allowed is not None:
-        splines = [_within(moments, rows, degree, allowed)]
+        splines = [_within(moments, centred, degree, _without_rounding(allowed, rows))]
     elif sums is not None:
-        splines = [_smooth(moments, row, degree, s) for row, s in zip(rows, sums.tolist(), strict=True)]
+        roots = _without_rounding(np.sqrt(sums / moments.size), rows)
+        splines = [_smooth(moments, row, degree, root) for row, root in zip(centred, roots.tolist(), strict=True)]
     else:
-        splines = [_interpolating(moments, rows.T, degree)]
+        splines = [_interpolating(moments, centred.T, degree)]
     knots = np.unique(np.concatenate([spline.t for spline in splines]))
     table = np.empty((degree + 1, knots.size - 1, len(rows)))
     for k in range(degree + 1):
         table[-1 - k] = np.concatenate([spline(knots[:-1], nu=k) for spline in splines], axis=1) / FACTORIALS[k]
-    deviation = np.abs(_values(knots, table, moments) - rows.T).max(axis=0)
-    if allowed is not None and (deviation > allowed).any():
-        axis = int((deviation / allowed).argmax())
-        raise ValueError(
-            f"tolerance must be at least {deviation[axis]:.3g}, the deviation by rounding of a spline through all "
-            f"samples of axis {axis}, got {allowed[axis]:g}: it would require more knots than the {moments.size} "
-            "samples"
-        )
+    table[-1] += middle
+    plan = PiecewisePolynomial(knots, table, labels=labels)
+    errors = _errors(plan, moments, rows)
+    deviation = errors.max(axis=1)
+    if allowed is not None:
+        _check_reached("tolerance", "deviation", deviation, allowed, rows, splines * len(rows))
+    elif sums is not None:
+        with np.errstate(over="ignore"):
+            found = np.where(sums > 0.0, (errors**2).sum(axis=1), 0.0)
+        _check_reached("smoothing", "sum of squared deviations", found, sums, rows, splines)
     plan = PiecewisePolynomial(knots, table, labels=labels, deviation=deviation)
     if warn:
         _warn_of_swing(plan, rows)
     return plan
 
 
-def _values(knots: Array, table: Array, times: Array) -> Array:
-    """Values (ntime, naxes) of the polynomials themselves, whose coefficients are rounded."""
-    segments = np.searchsorted(knots[1:-1], times, side="right")
-    s = (times - knots[segments])[:, None]
-    found = table[0].take(segments, axis=0)
+def _middle(rows: Array) -> Array:
+    """Middle value of each axis (naxes,) far from zero, which is subtracted without rounding; 0 of others."""
+    low, high = 0.5 * rows.min(axis=1), 0.5 * rows.max(axis=1)
+    return np.where(0.5 * np.abs(low + high) > high - low, low + high, 0.0)
+
+
+def _without_rounding(limits: Array, rows: Array) -> Array:
+    """Limits (naxes,) for a spline whose constants and values are rounded afterwards; 0 if there is no room for it."""
+    return np.maximum(limits - _ROUNDINGS * np.spacing(np.abs(rows).max(axis=1)), 0.0)
+
+
+def _errors(plan: PiecewisePolynomial, times: Array, rows: Array) -> Array:
+    """Deviations (naxes, nsamples) of the values of a plan, at all times together or one by one."""
+    segments = np.searchsorted(plan.breakpoints[1:-1], times, side="right")
     with np.errstate(over="ignore", invalid="ignore"):
-        for row in table[1:]:
-            found = found * s + row.take(segments, axis=0)
-    return found
+        single = plan.segments_jet(segments, times - plan.breakpoints[segments], 0)[0]
+    return np.maximum(np.abs(single - rows), np.abs(plan(times).reshape(rows.shape) - rows))
+
+
+def _check_reached(
+    name: str, measure: str, found: Array, allowed: Array, rows: Array, splines: Sequence[BSpline]
+) -> None:
+    """Raise if what was found (naxes,) at the samples is more than the argument of this name allows."""
+    reached = found <= allowed
+    if reached.all():
+        return
+    axis = int(reached.argmin())
+    spline, nsamples = splines[axis], rows.shape[1]
+    start = f"{name} must be at least {found[axis]:.3g}, the {measure} by rounding"
+    advice = f"; use a larger {name}, which requires fewer knots" + (", or lower continuity" if spline.k > 1 else "")
+    if len(spline.c) < nsamples:
+        raise ValueError(
+            f"{start} of the polynomials of degree {spline.k} in the {np.unique(spline.t).size - 1} segments of axis "
+            f"{axis}, got {allowed[axis]:g}{advice}"
+        )
+    raise ValueError(
+        f"{start} of a spline through all samples of axis {axis}, got {allowed[axis]:g}: it would require more knots "
+        f"than the {nsamples} samples, which are rounded by {0.5 * np.spacing(np.abs(rows[axis]).max()):.2g} "
+        f"themselves{advice}"
+    )
 
 
 def _warn_of_swing(plan: PiecewisePolynomial, rows: Array) -> None:
@@ -225,25 +267,41 @@ def _interpolating(times: Array, columns: Array, degree: int) -> BSpline:
     return make_interp_spline(times, columns, k=degree)
 
 
-def _smooth(times: Array, row: Array, degree: int, total: float) -> BSpline:
-    """Smoothing spline of one axis whose sum of squared deviations is at most `total`."""
+def _smooth(times: Array, row: Array, degree: int, limit: float) -> BSpline:
+    """Smoothing spline of one axis whose root mean square of deviations is at most `limit`.
+
+    The knots of FITPACK are written beyond its arrays for degrees below 3, where the
+    intervals between all samples are used up before its sum is reached, and where squares
+    of samples underflow. So it is given cubics and quintics of samples near 1 only.
+    """
     from scipy.interpolate import BSpline, splrep
 
-    if total == 0.0:
+    if degree < 3:
+        return _within(times, row[None], degree, np.array([limit]), mean=True)
+    exponent = int(np.frexp(np.abs(row).max())[1])
+    scaled, root = np.ldexp(row, -exponent), min(float(np.ldexp(limit, -exponent)), 2.0)
+    if root <= np.finfo(float).eps:
         return _interpolating(times, row[:, None], degree)
+    total = root**2 * row.size
     # FITPACK reaches its sum to 1e-3; instead of its messages, the sum is measured.
-    (knots, coefficients, _), *_ = splrep(times, row, k=degree, s=total / 1.001, full_output=1, quiet=1)
+    (knots, coefficients, _), *_ = splrep(times, scaled, k=degree, s=total / 1.001, full_output=1, quiet=1)
     spline = BSpline(knots, coefficients[: knots.size - degree - 1, None], degree)
-    found = ((spline(times)[:, 0] - row) ** 2).sum() <= total
-    return spline if found else _interpolating(times, row[:, None], degree)
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = ((spline(times)[:, 0] - scaled) ** 2).sum() <= total * (1.0 - _ROUNDING)
+    if not found:
+        return _interpolating(times, row[:, None], degree)
+    return BSpline(knots, np.ldexp(spline.c, exponent), degree)
 
 
-def _within(times: Array, rows: Array, degree: int, limits: Array) -> BSpline:
-    """Least-squares spline of all axes, with knots added where samples deviate by more than limits (naxes,)."""
+def _within(times: Array, rows: Array, degree: int, limits: Array, *, mean: bool = False) -> BSpline:
+    """Least-squares spline of all axes, with knots added where samples deviate by more than limits (naxes,).
+
+    The limits are those of each sample or, with `mean`, of the root mean square.
+    """
     last = times.size - 1
     chosen, precise = np.array([0, last]), False
     # As many coefficients as samples are those of the interpolating spline.
-    while chosen.size - 1 + degree < times.size:
+    while chosen.size - 1 + degree < times.size and limits.all():
         knots = np.concatenate([times[[0] * degree], times[chosen], times[[last] * degree]])
         quick = chosen.size > _MANY and not precise
         try:
@@ -255,16 +313,26 @@ def _within(times: Array, rows: Array, degree: int, limits: Array) -> BSpline:
             continue
         with np.errstate(over="ignore", invalid="ignore"):
             excess = (np.abs(spline(times) - rows.T) / (limits * (1.0 - _ROUNDING))).max(axis=1)
-        if quick and not (np.isfinite(excess).all() and (excess > 1.0).any()):  # these are the knots
+            worst = _by_interval(excess, chosen, mean)
+            reached = (worst <= 1.0).all() or (mean and (excess**2).mean() <= 1.0)
+        if quick and (reached or not np.isfinite(worst).all()):  # these are the knots
             precise = True
             continue
-        if (excess <= 1.0).all():
+        if reached:
             return spline
-        if not np.isfinite(excess).all():
+        if not np.isfinite(worst).all():
             break
-        worst = np.maximum.reduceat(excess, chosen[:-1])  # the last sample belongs to the last interval
         chosen = _divided(chosen, worst, degree)
     return _interpolating(times, rows.T, degree)
+
+
+def _by_interval(excess: Array, chosen: NDArray[np.intp], mean: bool) -> Array:
+    """Maximum or root mean square of the samples in each interval; the last sample belongs to the last one."""
+    if not mean:
+        return np.maximum.reduceat(excess, chosen[:-1])
+    sizes = np.diff(chosen)
+    sizes[-1] += 1
+    return np.sqrt(np.add.reduceat(excess**2, chosen[:-1]) / sizes)
 
 
 def _least_squares(times: Array, columns: Array, knots: Array, degree: int, quick: bool) -> BSpline:

@@ -1,6 +1,8 @@
 """Plans through samples, against the samples themselves, scipy's own splines and functions that a spline reproduces."""
 
 import re
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -235,3 +237,163 @@ def test_a_tolerance_near_the_noise_takes_many_knots_of_least_squares(spacing):
     knots = np.concatenate([[plan.start] * degree, plan.breakpoints, [plan.end] * degree])
     peer = si.make_lsq_spline(t, y, knots, k=degree)
     np.testing.assert_allclose(plan(t), peer(t), rtol=0, atol=1e-12)
+
+
+def root_of_squares(plan, times, values):
+    return np.sqrt(((plan(times) - values) ** 2).sum())
+
+
+CRASHES = """
+import numpy as np, ctrlplan as cp
+rng = np.random.default_rng(0)
+t = np.arange(100.0)
+for values in ((rng.random(100) < 0.5) * 1.0, (t > 50.0) * 1.0, np.eye(1, 100, 40)[0], rng.normal(size=100)):
+    for scale, total in ((1.0, 1e-6), (1.0, 1e-2), (1e-160, 1e-315), (1e-160, 5e-324), (1e-300, 5e-324)):
+        for continuity in range(5):
+            plan = cp.fit(t, scale * values, smoothing=total, continuity=continuity, warn=False)
+            found = ((plan(t) - scale * values) ** 2).sum()
+            assert found <= total, (scale, total, continuity, found)
+print("done")
+"""
+
+
+def test_smoothing_of_any_continuity_and_size_leaves_the_process_alive():
+    """FITPACK itself ends the process for degree 1, and where squares of the samples underflow."""
+    run = subprocess.run([sys.executable, "-c", CRASHES], capture_output=True, text=True, timeout=300)
+    assert (run.returncode, run.stdout.strip()) == (0, "done"), run.stderr
+
+
+@pytest.mark.parametrize("noise", [0.1, 1e-3])
+def test_smoothing_without_continuous_velocity_takes_few_knots(noise):
+    """A polyline of 4 parts under noise: the sum is met, by far fewer knots than samples, near the true polyline."""
+    rng = np.random.default_rng(8)
+    t = np.linspace(0.0, 4.0, 2001)
+    true = np.interp(t, [0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 2.0, -1.0, 0.0, 3.0])
+    values = true + noise * rng.normal(size=t.size)
+    total = 1.05 * ((values - true) ** 2).sum()
+    plan = cp.fit(t, values, smoothing=total, continuity=0)
+    assert ((plan(t) - values) ** 2).sum() <= total
+    assert plan.breakpoints.size < 60
+    assert root_of_squares(plan, t, true) < 0.4 * np.sqrt(total)
+    peer = si.make_lsq_spline(t, values, np.concatenate([[0.0], plan.breakpoints, [4.0]]), k=1)
+    np.testing.assert_allclose(plan(t), peer(t), rtol=0, atol=1e-12)
+
+
+def test_smoothing_without_continuous_velocity_near_every_sample():
+    """Many knots, which are chosen by normal equations; each axis has its own sum."""
+    rng = np.random.default_rng(9)
+    t = np.sort(rng.uniform(0.0, 10.0, 1500))
+    values = np.stack([np.sin(t), 5.0 * np.cos(t)]) + rng.normal(size=(2, t.size)) * [[0.01], [0.1]]
+    sums = t.size * np.array([0.006, 0.07]) ** 2
+    plan = cp.fit(t, values, smoothing=sums, continuity=0)
+    assert (((plan(t) - values) ** 2).sum(axis=1) <= sums).all()
+    assert 200 < plan.breakpoints.size < t.size
+
+
+@pytest.mark.parametrize(
+    ("offset", "samples", "tolerance"),
+    [(0.0, 20_000, 1e-6), (1e9, 20_000, 1e-6), (-1e9, 20_000, 1e-6), (1e9, 20_000, 9e-7), (1e12, 5000, 1e-3)],
+)
+def test_a_far_origin_takes_the_knots_of_a_near_one(offset, samples, tolerance):
+    """Samples, constants and values of the plan are rounded, by less than 7 spacings of numbers together."""
+    t = np.linspace(0.0, 100.0, samples)
+    values = np.sin(t) + offset
+    plan = cp.fit(t, values, tolerance=tolerance)
+    assert np.abs(plan(t) - values).max() <= tolerance
+    near = cp.fit(t, np.sin(t), tolerance=tolerance - 7.0 * np.spacing(abs(offset) + 1.0))
+    assert plan.breakpoints.size < 1.5 * near.breakpoints.size + 10
+
+
+def test_a_far_origin_of_one_axis_and_of_smoothing():
+    t = np.linspace(0.0, 20.0, 2000)
+    values = np.stack([np.sin(t), np.cos(t) - 1e9])
+    plan = cp.fit(t, values, tolerance=[1e-9, 1e-5])
+    assert (np.abs(plan(t) - values).max(axis=1) <= [1e-9, 1e-5]).all()
+    noise = 1e-3 * np.random.default_rng(4).normal(size=t.size)
+    for continuity in (0, 2, 4):
+        near, far = (
+            cp.fit(t, np.sin(t) + noise + offset, smoothing=t.size * 1e-6, continuity=continuity)
+            for offset in (0.0, 1e9)
+        )
+        assert ((far(t) - (np.sin(t) + noise + 1e9)) ** 2).sum() <= t.size * 1e-6
+        np.testing.assert_allclose(far(t) - 1e9, near(t), rtol=0, atol=2e-4)
+
+
+def test_a_tolerance_below_the_rounding_of_samples():
+    """Through all samples without deviation, or the message names their rounding: 1 is rounded by 2**-53."""
+    t = np.linspace(0.0, 10.0, 200)
+    plan = cp.fit(t, np.sin(t) + 1e9, tolerance=1e-12)
+    np.testing.assert_array_equal(plan(t), np.sin(t) + 1e9)
+    noise = np.append(1.0, np.random.default_rng(0).uniform(-1.0, 1.0, 20_000))
+    with pytest.raises(ValueError, match=r"a spline through all samples of axis 0, .* which are rounded by 1.1e-16"):
+        cp.fit(np.linspace(0.0, 100.0, noise.size), noise, tolerance=1e-18, warn=False)
+
+
+def test_constant_samples():
+    """Two knots, or the samples themselves below their rounding."""
+    t = np.linspace(0.0, 10.0, 500)
+    for constant in (1e15, 0.1, -8.1, 0.0):
+        values = np.full(t.size, constant)
+        for continuity in (0, 2, 4):
+            for tolerance in (1e-17, 1e-12 * max(1.0, abs(constant))):
+                plan = cp.fit(t, values, continuity=continuity, tolerance=tolerance)
+                assert np.abs(plan(t) - values).max() <= tolerance
+            assert plan.breakpoints.size == 2
+            plan = cp.fit(t, values, continuity=continuity, smoothing=1e-20)
+            assert ((plan(t) - values) ** 2).sum() <= 1e-20
+
+
+UNEVEN = np.cumsum(10.0 ** np.random.default_rng(0).uniform(-12.0, 3.0, 300))
+
+
+@pytest.mark.parametrize("total", [1e-2, 2e-14])
+def test_a_sum_that_rounding_exceeds_is_refused(total):
+    """Quintics through noise swing far between very uneven times; a polyline does not."""
+    values = np.random.default_rng(7).normal(size=UNEVEN.size)
+    plan = cp.fit(UNEVEN, values, smoothing=total, continuity=0)
+    assert ((plan(UNEVEN) - values) ** 2).sum() <= total
+    with pytest.raises(ValueError, match="of axis 1, got"):  # not of the one that interpolates
+        cp.fit(UNEVEN, [np.zeros(UNEVEN.size), values], smoothing=[0.0, total], continuity=4, warn=False)
+    exact = cp.fit(UNEVEN, values, continuity=4, warn=False)
+    assert exact.deviation[0] > 1.0
+    with pytest.raises(
+        ValueError, match=r"smoothing must be at least .*, the sum of squared deviations by rounding of"
+    ):
+        cp.fit(UNEVEN, values, smoothing=total, continuity=4, warn=False)
+
+
+@pytest.mark.parametrize("continuity", range(5))
+@pytest.mark.parametrize("total", 10.0 ** np.arange(-16.0, 3.0, 3.0))
+def test_smoothing_holds_wherever_there_is_a_plan(continuity, total):
+    for values in (np.sin(UNEVEN), np.sqrt(UNEVEN), 1e6 + np.log(UNEVEN)):
+        try:
+            plan = cp.fit(UNEVEN, values, smoothing=total, continuity=continuity, warn=False)
+        except ValueError:
+            continue
+        assert ((plan(UNEVEN) - values) ** 2).sum() <= total
+
+
+def test_rounding_of_a_least_squares_spline_is_not_said_to_be_of_all_samples():
+    """Quintics with large coefficients between pairs of near samples, and few knots in a long constant part."""
+    times = np.append(np.ravel([(k, k + 1e-6) for k in range(10)]), np.linspace(11.0, 20.0, 91))
+    values = np.append(np.resize([0.0, 1.0], 20), np.zeros(91))
+    with pytest.raises(
+        ValueError, match=r"the polynomials of degree 5 in the \d\d segments of axis 0, got 0.01; use"
+    ) as e:
+        cp.fit(times, values, tolerance=0.01, continuity=4, warn=False)
+    assert "samples" not in str(e.value)
+    plan = cp.fit(times, values, tolerance=0.01, continuity=0)
+    assert np.abs(plan(times) - values).max() <= 0.01
+
+
+@pytest.mark.parametrize("continuity", range(5))
+@pytest.mark.parametrize("options", [{}, {"tolerance": 1e-13}, {"tolerance": 0.5}, {"smoothing": 1000.0}])
+def test_the_deviation_holds_for_values_of_the_plan_to_the_last_digit(continuity, options):
+    """White noise, of which rounding is the whole deviation of an interpolating spline."""
+    t = np.linspace(0.0, 100.0, 4000)
+    values = np.random.default_rng(0).normal(size=t.size)
+    plan = cp.fit(t, values, continuity=continuity, warn=False, **options)
+    together = np.abs(plan(t) - values).max()
+    single = np.abs([plan(time) for time in t.tolist()] - values).max()
+    assert plan.deviation[0] == max(together, single)
+    assert plan.deviation[0] <= options.get("tolerance", np.inf)
