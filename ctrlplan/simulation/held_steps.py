@@ -51,6 +51,9 @@ _STEPS = 250
 _HOPS = 6
 """Number of delays after which a jump of an input has become smooth enough to be ignored."""
 
+_SAME = 1e-14
+"""Relative difference of the times of two jumps that is rounding."""
+
 
 class Grid:
     """Times start + k dt as fractions, so that 3 times 0.1 s is 0.3 s."""
@@ -374,8 +377,7 @@ class NumericalSteps:
             times = np.unique(np.concatenate(plans))
             self._course.add_rounding(np.union1d(np.linspace(times[0], times[-1], 257), times))
         endless = self._equations is not None and network.delays_feed_delays(self._equations.feeds)
-        delays = [network.blocks[i].delay or 0.0 for i in network.blocks_with("delay")]
-        self._jumps = Jumps(delays, math.inf if endless else _HOPS)
+        self._jumps = Jumps(self._course.memory.delays, math.inf if endless else _HOPS)
         self._jumps.add([t for t in (grid.time(0), *network.breakpoints) if t >= grid.time(0)])
 
     @property
@@ -597,6 +599,8 @@ class Jumps:
         found: list[float] = []
         while self._heap and self._heap[0][0] < end:
             t, hops = heapq.heappop(self._heap)
+            while self._heap and self._heap[0][0] - t <= _SAME * abs(t):  # the same by other delays
+                hops = max(hops, heapq.heappop(self._heap)[1])
             found.append(t)
             for delay in self._delays if hops > 0 else ():
                 heapq.heappush(self._heap, (t + delay, hops - 1))
