@@ -112,7 +112,7 @@ def _functions(system: System) -> Iterator[Callable[..., Value]]:
 
 
 def _goes_on(value: object) -> bool:
-    """Whether an object has no memory of a run, or is meant to go on: clocks, caches, files, random generators."""
+    """Whether an object has no memory of a run, or is meant to go on: a cache, a file, a random generator."""
     return isinstance(value, _GO_ON) or hasattr(value, "cache_info") or is_impure(type(value))
 
 

@@ -159,7 +159,7 @@ def simulate(
     outputs, then the updates, each once per sample; they may therefore have
     memory other than their states, as an attribute or a variable of a closure.
     What they remember after a run can be read, and the next `simulate` goes on
-    from it: reset it, or build the loop anew, for equal runs. `compare`, `sweep`,
+    from it: reset it, or build a new loop, for equal runs. `compare`, `sweep`,
     `monte_carlo`, `margins` and `fastest` begin each run with the memory that the
     blocks had before, and leave it as it was. The functions of a continuous block
     must return equal values for equal arguments.
