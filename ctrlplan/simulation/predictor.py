@@ -14,6 +14,7 @@ from ctrlplan._types import Array, Frozen, Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.built_forms import NotApplicableError
 from ctrlplan.simulation.interpreted import LoopError, SolverError
+from ctrlplan.simulation.memory import kept_memory
 from ctrlplan.simulation.prepared import Prepared, prepare
 from ctrlplan.simulation.simulate import checked_job, response_to
 
@@ -247,7 +248,8 @@ class Predictor(Displayed, Frozen):
             for method in methods.applicable(methods.METHODS, self._prepared):
                 job = checked_job(self._prepared, self._times, inputs, state, *_TOLERANCES, self._params, events=())
                 try:
-                    found = response_to(job, [method])
+                    with kept_memory(job.network, job.prepared.is_discrete):
+                        found = response_to(job, [method])
                 except (SolverError, LoopError):
                     return None
                 except NotApplicableError:  # not compilable: the next method

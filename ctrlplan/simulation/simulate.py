@@ -23,6 +23,7 @@ from ctrlplan.simulation.held_outputs import HeldOutputs
 from ctrlplan.simulation.interpreted import FeedthroughError
 from ctrlplan.simulation.interruptions import passing_interruptions
 from ctrlplan.simulation.job import Job, Record, fresh_job
+from ctrlplan.simulation.memory import kept_memory
 from ctrlplan.simulation.methods import Method
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.response import SimulationResponse
@@ -156,8 +157,12 @@ def simulate(
 
     Discrete blocks are evaluated in the order of the signal flow, first the
     outputs, then the updates, each once per sample; they may therefore have
-    memory other than their states. The functions of a continuous block must
-    return equal values for equal arguments.
+    memory other than their states, as an attribute or a variable of a closure.
+    What they remember after a run can be read, and the next `simulate` goes on
+    from it: reset it, or build a new loop, for equal runs. `compare`, `sweep`,
+    `monte_carlo`, `margins` and `fastest` begin each run with the memory that the
+    blocks had before, and leave it as it was. The functions of a continuous block
+    must return equal values for equal arguments.
 
     A run by Python that makes no progress ends with an error: after 2,000
     evaluations of the equations about one time, or when 60,000 evaluations
@@ -185,13 +190,15 @@ def simulate_for_metrics(
     """Time response as by `simulate`, the event that ends it, and the held parts of its outputs; None without any.
 
     Other events are located when they are first read, if that calls no functions of
-    the user: many runs are wanted for their metrics only.
+    the user: many runs are wanted for their metrics only. The blocks have the same
+    memory after the run as before it.
     """
     job = checked_job(system, timepts, inputs, initial_state, params=params, events=events)
     warn_of_unread(job.prepared, job.params)
     warn_of_timebase(job.prepared)
-    response, stop, record = _response_and_end(job, methods.METHODS, later=True)
-    held = record.held() if record.held is not None else None
+    with kept_memory(job.network, job.prepared.is_discrete):
+        response, stop, record = _response_and_end(job, methods.METHODS, later=True)
+        held = record.held() if record.held is not None else None
     if held is not None:
         held = held.on(response.t, time_tolerance(job.first, float(job.times[-1])))
     return response, stop, held

@@ -17,8 +17,11 @@ from ctrlplan._types import Array, System
 from ctrlplan.simulation.equilibrium import equilibrium_at
 from ctrlplan.simulation.loop_inputs import Fed, fed_signals, is_cyclic, same_axis, tracked
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse, LoopSignals, signal_names
+from ctrlplan.simulation.memory import kept_memory
 from ctrlplan.simulation.network import Block
 from ctrlplan.simulation.prepared import Prepared, prepared_form
+from ctrlplan.simulation.response import SimulationResponse
+from ctrlplan.simulation.signals import Inputs
 from ctrlplan.simulation.simulate import simulate
 from ctrlplan.trajectories import Step, Trajectory
 from ctrlplan.trajectories.internal import InternalTrajectory
@@ -205,8 +208,8 @@ class SimulatedResponse(LoopResponse):
         if self._final is None:
             return before, math.nan
         step = float(self._prepared.dt) if self._prepared.is_discrete else 1e-2 * self.plan.duration
-        times, held = self.plan.end + step * np.arange(2), self._inputs.final
-        response = simulate(self._prepared, times, held.tolist() or None, self._final, rtol=self._rtol, events=())
+        times, held = np.array([self.plan.end, self.plan.end + step]), self._inputs.final
+        response = self._simulated(times, held.tolist() or None, self._final)
         return before, float(self._sum(weights, self._signals(response.y[..., :1], held[:, None]))[0])
 
     @cached_property
@@ -281,8 +284,13 @@ class SimulatedResponse(LoopResponse):
         start = self.plan.start
         wanted = times if times[0] <= start and times.size > 1 else np.union1d(times, [start, self._last])
         inputs = self._inputs if self._prepared.ninputs else None
-        response = simulate(self._prepared, wanted, inputs, self._start, rtol=self._rtol, events=())
+        response = self._simulated(wanted, inputs, self._start)
         return response.t, self._signals(response.y, self._inputs.jet(response.t, 0)[0])
+
+    def _simulated(self, times: Array, inputs: Inputs, start: Array | None) -> SimulationResponse:
+        """Response from a start; the blocks have the same memory after it as before."""
+        with kept_memory(self._prepared.network, self._prepared.is_discrete):
+            return simulate(self._prepared, times, inputs, start, rtol=self._rtol, events=())
 
     def _signals(self, outputs: Array, inputs: Array) -> Array:
         """Outputs, and inputs that have other names."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import types
+from array import array
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
@@ -56,6 +57,8 @@ def contents_of(value: object) -> object:
         return value.copy() if value.flags.writeable else None
     if isinstance(value, list | dict | set | bytearray | deque):
         return value.copy()
+    if isinstance(value, array):
+        return value[:]
     if isinstance(value, Slots):
         return value.values()
     own = getattr(value, "__dict__", None) if not isinstance(value, Frozen) else None
@@ -86,6 +89,8 @@ def restore(value: object, before: object) -> None:
     elif isinstance(value, dict | set) and isinstance(before, dict | set):
         value.clear()
         value.update(before)
+    elif isinstance(value, array) and isinstance(before, array):
+        value[:] = before
     elif isinstance(value, deque) and isinstance(before, deque):
         value.clear()
         value.extend(before)

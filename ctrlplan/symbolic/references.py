@@ -87,6 +87,10 @@ class References:
         Names and strings in the code of the functions.
     objects : list
         All objects found.
+    hidden : list
+        Those with a state that cannot be read, such as generators.
+    complete : bool
+        Whether all objects were found; otherwise there are too many.
     bindings : list of (object, str, object)
         Names of modules, classes and closures, and their values.
     """
@@ -97,6 +101,8 @@ class References:
         self._tokens: list[object] = []
         self._seen: dict[int, int] = {}
         self.objects: list[object] = []  # references, so that no address is reused
+        self.hidden: list[object] = []
+        self.complete = True
         self._queue: deque[tuple[object, str]] = deque()
         self._named: list[tuple[object, str, set[str]]] = []  # objects of which the named attributes matter
         self.bindings: list[tuple[object, str, object]] = []
@@ -109,6 +115,7 @@ class References:
             self._walk()
         except Exception as error:  # any exception of an object during inspection
             self._hide(f"which cannot be inspected: {type(error).__name__}", "an object")
+            self.complete = False
         self.tokens = tuple(self._tokens)
         self.cached = References(self._cached.items()).tokens if self._cached else ()
 
@@ -119,6 +126,7 @@ class References:
             self._visit(*self._queue.popleft())
             if len(self.objects) > _MAXIMUM or self._bytes > _BYTES:
                 self._hide("too large to be compared in every run", "objects and arrays")
+                self.complete = False
                 return
             if not self._queue:
                 self._add_named()
@@ -356,12 +364,14 @@ class References:
     def _nothing(self, value: object, where: str) -> None:
         """Objects with a hidden state."""
         self._hide(_KINDS.get(type(value).__name__, f"an object of {type(value).__module__}"), where)
+        self.hidden.append(value)
         self._tokens.append(Same(value))
 
     def _instance(self, value: object, where: str) -> None:
         kind = type(value)
         if is_impure(kind) or not all(written_in_python(base) for base in kind.__mro__[:-1]):
             self._hide(_KINDS.get(kind.__name__, f"an object of {kind.__module__}.{kind.__qualname__}"), where)
+            self.hidden.append(value)
             self._tokens.append(Same(value))
             return
         self._attributes(value, where)

@@ -204,7 +204,7 @@ def _has_memory(value: object, seen: set[int], depth: int) -> bool:
         named = [value.__globals__[name] for name in _names(code) if name in value.__globals__]
         parts = (*_contents(value), *(value.__defaults__ or ()), *(value.__kwdefaults__ or {}).values(), *named)
     else:
-        return not of_library(type(value))
+        return not of_library(type(value)) or hasattr(type(value), "step")  # a `Stepper`, or a solver of scipy
     return any(_has_memory(part, seen, depth - 1) for part in parts)
 
 
