@@ -120,7 +120,13 @@ class Retimed(Trajectory):
         return out
 
     def times_at(self, places: Array) -> Array:
-        """Times [s] at which the law reaches times [s] of the plan, those outside of it at its ends."""
+        """Times [s] at which the law reaches given times of the plan.
+
+        Parameters
+        ----------
+        places : ndarray, shape (ntimes,)
+            Times [s] of the plan; its ends stand for those outside of it.
+        """
         values = self.law(self.law.breakpoints)
         inside, slack = np.clip(places, values[0], values[-1]), _ROUNDING * float(values[-1] - values[0])
         return np.array([_passing(self.law, values, place, slack) for place in inside.tolist()])
