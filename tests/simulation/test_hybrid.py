@@ -303,7 +303,7 @@ LATE.name = "outer"
         ((HELD, 0.1, math.nan), ValueError, "offset must be finite and at least 0, got nan"),
         ((plant(), 0.1), ValueError, "block must be discrete, got plant with dt = 0: see control.sample_system"),
         ((ct.tf([1], [1, 1], name="lag"), 0.1), ValueError, "block must be discrete, got lag"),
-        ((ct.frd([1, 2], [1, 2], name="data"), 0.1), TypeError, "block must have equations, got data with a frequency"),
+        ((ct.frd([1, 2], [1, 2], name="data"), 0.1), TypeError, "block must have equations, got data with its"),
         ((cp.create_delay_iosystem(0.1, name="late"), 0.1), ValueError, "got late with the delay late; connect the"),
         (
             (LATE, 0.1),
