@@ -134,11 +134,11 @@ def fit(
     errors = _errors(plan, moments, rows)
     deviation = errors.max(axis=1)
     if allowed is not None:
-        _check_reached("tolerance", "deviation", deviation, allowed, rows, splines * len(rows))
+        _refuse_missed("tolerance", "deviation", deviation, allowed, rows, splines * len(rows))
     elif sums is not None:
         with np.errstate(over="ignore"):
             found = np.where(sums > 0.0, (errors**2).sum(axis=1), 0.0)
-        _check_reached("smoothing", "sum of squared deviations", found, sums, rows, splines)
+        _refuse_missed("smoothing", "sum of squared deviations", found, sums, rows, splines)
     plan = PiecewisePolynomial(knots, table, labels=labels, deviation=deviation)
     if warn:
         _warn_of_swing(plan, rows)
@@ -164,7 +164,7 @@ def _errors(plan: PiecewisePolynomial, times: Array, rows: Array) -> Array:
     return np.maximum(np.abs(single - rows), np.abs(plan(times).reshape(rows.shape) - rows))
 
 
-def _check_reached(
+def _refuse_missed(
     name: str, measure: str, found: Array, allowed: Array, rows: Array, splines: Sequence[BSpline]
 ) -> None:
     """Raise if what was found (naxes,) at the samples is more than the argument of this name allows."""
