@@ -125,14 +125,9 @@ class PlansByDuration:
         """Samples of each part at relative times."""
         found = []
         for part in self._parts:
-            times, weights = (
-                part.plan.start + fractions * part.plan.duration,
-                np.full(fractions.size, 1 / fractions.size),
-            )
-            jet, moments = (
-                self.limited.seen(part.plan).jet(times, self.limited.order),
-                self.limited.moments(part.plan, times),
-            )
+            times = part.plan.start + fractions * part.plan.duration
+            jet = self.limited.seen(part.plan).jet(times, self.limited.order)
+            moments, weights = self.limited.moments(part.plan, times), np.full(fractions.size, 1.0 / fractions.size)
             found.append(Sampled(jet, fractions, moments, weights, part.plan.duration))
         return found
 

@@ -155,7 +155,6 @@ def integrate(
         course.prolong(apart([first, *marks, last])[1:-1], first, last)
     memory, schedule, rounding = course.memory, course.schedule, course.rounding
     shortest, reach, longest = _lengths(network, memory.delays, last - first, stops_after is not None)
-    memory.check_held(schedule.tolerance)
     found, span, left = _Recorded(), list[Series](), first
     x = schedule.sample(equations, first, state)
     while left < last:
@@ -168,9 +167,8 @@ def integrate(
             right = left + reach if stops_after is None else _reached(times, left, reach)
         if memory.has_delays or not (span and span[-1].right >= right):
             until = right if memory.has_delays else schedule.fixed_after(left)
-            accuracy = resolution if memory.delays else RESOLVED
             error = np.maximum(rounding, memory.rounding)
-            span = time_signals.series(0.5 * (left + right), left, until, accuracy, error)
+            span = time_signals.series(0.5 * (left + right), left, until, memory.accuracy, error)
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
         inside = times[times.searchsorted(left) : times.searchsorted(right)]
@@ -246,6 +244,7 @@ class Course:
     ) -> None:
         self._time_signals = time_signals
         self.memory = _Memory(network, solver, time_signals, resolution)
+        self.memory.check_held(time_tolerance(*span))
         self.schedule = _Schedule(network, time_signals, *span)
         self.rounding: Array = np.zeros(time_signals.width)
 
@@ -355,7 +354,7 @@ class _Memory:
         self._every, self._all_time_signals = late, time_signals
         self._held = [(signal, network.fed[i]) for signal, i in pairs if isinstance(signal, HeldDelaySignal)]
         self._time_signals = [signal for signal in late if not isinstance(signal, HeldDelaySignal)]
-        blocks = [i for signal, i in pairs if not isinstance(signal, HeldDelaySignal)]
+        blocks = [i for signal, i in pairs if signal in self._time_signals]
         self._fed = [network.fed[i] for i in blocks]
         self._wires, self._time_rows = [network.wire[network.inputs[i]] for i in blocks], network.time_rows
         self._solver, self._resolution = solver, resolution
@@ -364,11 +363,16 @@ class _Memory:
         self._rows = [
             slice(end - signal.width, end)
             for signal, end in zip(time_signals, ends.tolist(), strict=True)
-            if isinstance(signal, DelayedSignal) and not isinstance(signal, HeldDelaySignal)
+            if signal in self._time_signals
         ]
         self.rounding: Array = np.zeros(time_signals.width)
         self._ends: list[Array | None] = [None for _ in self._time_signals]
         self.jumps: list[float] = []
+
+    @property
+    def accuracy(self) -> float:
+        """Relative accuracy of the series of the functions of time."""
+        return self._resolution if self._time_signals else RESOLVED
 
     @property
     def has_delays(self) -> bool:
@@ -481,11 +485,6 @@ class _Schedule:
     def marks(self) -> list[float]:
         """Breakpoints, and the end of the run."""
         return self._fixed
-
-    @property
-    def tolerance(self) -> float:
-        """Difference of two times [s] up to which they are considered equal."""
-        return self._tolerance
 
     def following(self, t: float) -> float:
         """The next time after t."""

@@ -140,8 +140,8 @@ def sample_hold(
         If `block` is not a control system or has a frequency response only, or another
         argument has the wrong type.
     ValueError
-        If it is continuous with states, contains a delay, or has another period, a time is out of
-        range, or the number of names differs from the number of signals.
+        If it is continuous with states, contains a delay, or has another period, a
+        time is out of range, or the number of names differs from the number of signals.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Delays of what sampled blocks hold in nonlinear loops, compared with DOP853 started anew at each jump."""
+"""Delays of what sampled blocks hold in nonlinear loops, compared with DOP853 that starts at each jump."""
 
 from fractions import Fraction
 

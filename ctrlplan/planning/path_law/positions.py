@@ -16,7 +16,7 @@ from ctrlplan.trajectories.common import Array
 _FAR = 100.0
 """Distance from limits, in their scale, beyond which it is not resolved."""
 
-_INSIDE = 1e-9
+SHARE_INSIDE = 1e-9
 """Distance from the ends of a cell, relative to it, at which limits that jump there are evaluated."""
 
 
@@ -75,7 +75,7 @@ class _Rows:
     def segments_jet(self, segments: NDArray[np.intp], s: Array, order: int) -> Array:
         """Values (1, 2, ntime)."""
         first, last = self.breakpoints[segments], self.breakpoints[segments + 1]
-        inside = first + np.clip(s / (last - first), _INSIDE, 1.0 - _INSIDE) * (last - first)
+        inside = first + np.clip(s / (last - first), SHARE_INSIDE, 1.0 - SHARE_INSIDE) * (last - first)
         low, high = self.bound.sides(self.start + self.rate * (self.plan.law(inside) - self.plan.plan.start))
         values = self.plan.segments_jet(segments, s, self.bound.order)[self.bound.order, self.bound.axis or 0]
         return self.function(values, low, high)[None]

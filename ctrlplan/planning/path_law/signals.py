@@ -23,6 +23,7 @@ from ctrlplan.planning.path_law.grid import Grid, Spline
 from ctrlplan.planning.path_law.interior_point import Problem, minimum
 from ctrlplan.planning.path_law.jerk import on_pieces, smooth_law
 from ctrlplan.planning.path_law.law import problem_of
+from ctrlplan.planning.path_law.positions import SHARE_INSIDE
 from ctrlplan.planning.path_law.rows import Rows
 from ctrlplan.planning.path_law.spans import Part, Rates, parts_of
 from ctrlplan.trajectories import PiecewisePolynomial, Retimed, Trajectory
@@ -100,9 +101,6 @@ _SCALE, _BEYOND = 1e-4, 10.0
 
 _FAR = 1e6
 """Magnitude of a missing limit, in the scale of the other one."""
-
-_INSIDE = 1e-9
-"""Distance from the ends of a cell, relative to it, at which limits that jump there are evaluated."""
 
 HIGHEST = 5
 """Highest derivative of the plan on which signals may depend: the law has four continuous ones, the fifth jumps."""
@@ -335,24 +333,22 @@ class _Signals:
         slack = np.where(strict, np.where(self._at_rest(), _FAR, 0.0), slack)
         self._speeds = np.array([bound.order <= 1 for bound in bounds])[:, None] & self._at_given_speeds()
         self.strict, self._slack = strict, slack
-        self._low, self._high = self._sides(grid.times(points).T)
+        sides = self._given_sides(grid.times(points).T)
+        self._low, self._high = self._finite(*sides)
         ramp = (grid.length / grid.length.max()).repeat(points.size)
-        self._low_share, self._high_share = (
-            np.where(strict & (side == 0.0), ramp, 1.0) for side in self._given_sides(grid.times(points).T)
-        )
+        self._low_share, self._high_share = (np.where(strict & (side == 0.0), ramp, 1.0) for side in sides)
 
     def _given_sides(self, places: Array) -> tuple[Array, Array]:
         """Limits (nbounds, npoints), in their scale, at times (ncells, npoints) [s] of the plan in all cells."""
         grid = self._grid
         begin, length = (grid.plan.breakpoints[grid.segment] + grid.start)[:, None], grid.length[:, None]
-        inside = np.clip(places, begin + _INSIDE * length, begin + (1.0 - _INSIDE) * length).ravel()
+        inside = np.clip(places, begin + SHARE_INSIDE * length, begin + (1.0 - SHARE_INSIDE) * length).ravel()
         bounds = [self._limited.bounds[k] for k in self._moving]
         low, high = np.array([self._limited.sides(bound, grid.plan, inside) for bound in bounds]).swapaxes(0, 1)
         return low / self._scales, high / self._scales
 
-    def _sides(self, places: Array) -> tuple[Array, Array]:
-        """The same, finite and with slack where they are attained at rest."""
-        low, high = self._given_sides(places)
+    def _finite(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """Such limits, finite and with slack where they are attained at rest."""
         return (
             np.where(self._speeds, -_FAR, np.maximum(low, -_FAR) - self._slack),
             np.where(self._speeds, _FAR, np.minimum(high, _FAR) + self._slack),
@@ -408,7 +404,7 @@ class _Signals:
             values = self._limited.values(jet)[self._moving] / self._scales
         except ValueError:  # infeasible for the plant
             return np.full(self._grid.length.size, _INFEASIBLE)
-        low, high = (self._low, self._high) if self._limited.is_constant else self._sides(places)
+        low, high = (self._low, self._high) if self._limited.is_constant else self._finite(*self._given_sides(places))
         beyond = np.concatenate([values - high, low - values])
         return _peaks(beyond.reshape(len(beyond), -1, self._points.size)).max(axis=0)
 
