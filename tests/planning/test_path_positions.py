@@ -77,6 +77,7 @@ def test_a_crane_under_limits_by_position(name, times, values):
     )
 
 
+@pytest.mark.slow
 def test_functions_of_the_time_of_the_given_plan():
     def high(t):
         return 1500 - 400 * np.sin(t / 3)
@@ -98,6 +99,7 @@ def test_intervals_of_the_given_plan():
     assert fast < found.duration < slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [1800.0, 400.0])
 def test_limits_that_do_not_change_are_constant_ones(limit):
     expected = fastest(LIFT, {"F": limit}, CRANE, hold="path").duration
@@ -128,6 +130,7 @@ def test_a_quantity_that_is_a_derivative_has_the_law_of_the_derivative(values):
     assert found.duration == pytest.approx(expected.duration, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [0.0, 300.0, -40.0])
 @pytest.mark.parametrize("pace", [1.0, 1e-4, 1e5])
 def test_starts_and_durations_of_the_given_plan_do_not_matter(start, pace):
@@ -143,6 +146,7 @@ def test_starts_and_durations_of_the_given_plan_do_not_matter(start, pace):
     assert found.duration == pytest.approx(first.duration, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_plan_with_a_time_law_has_its_own_times():
     given = fastest(CURVE, {"effort": 0.5}, motion, hold="path").plan
     times, high = [0.0, given.duration], between([0.0, given.duration], [0.2, 0.9])
@@ -179,6 +183,7 @@ def test_durations_that_are_given():
         fastest(CURVE, limits, motion, hold="path", durations=(0.2 * shortest, 0.5 * shortest))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [4, 6])
 def test_higher_derivatives_of_an_axis(order):
     move = cp.PolySpline([Waypoint.from_jets(0, y=[0.0] * 7), Waypoint.from_jets(3, y=[2.0] + [0.0] * 6)])

@@ -144,6 +144,7 @@ def test_each_evaluation_of_limits_begins_with_the_first_memory(name, kind):
     np.testing.assert_allclose(found, peak, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["hold", "discrete"])
 def test_the_fastest_plan_holds_its_limit_with_a_new_law(kind):
     law = Attribute()
