@@ -61,6 +61,9 @@ _ROUNDINGS = 64.0
 _FIRST, _LATER = 8.0, 4.0
 """Length of the first segment, and maximum length of others, as fractions of a run that an event may end."""
 
+SAMPLES = 5_000_000
+"""Maximum number of sample times of a run: states at all of them are stored, and nonlinear loops take half an hour."""
+
 _MARKS = 20_000
 """Maximum number of times of jumps at which a run stops."""
 
@@ -585,13 +588,21 @@ def values_after(time_signals: Sequence[TimeSignal], times: Array, tolerance: fl
 
 
 def check_periods(blocks: Sequence[Block], first: float, last: float) -> None:
-    """Raise for sampled blocks with sample times that are not distinct in a run."""
+    """Raise for sampled blocks with sample times that are not distinct in a run, or far too many."""
     for block in blocks:
         if float(block.period or 0.0) < 4.0 * time_tolerance(first, last):
             raise ValueError(
                 f"the period of {block.name} must exceed the rounding of times up to "
                 f"{max(abs(first), abs(last)):g} s, got {block.period:g} s"
             )
+    counts = [(last - first) / float(block.period or np.inf) for block in blocks]
+    if sum(counts) > SAMPLES:
+        most = blocks[int(np.argmax(counts))]
+        raise ValueError(
+            f"a run must have at most {SAMPLES:.0e} sample times, got {sum(counts):.3g} in {last - first:g} s, with "
+            f"the period of {most.name} of {most.period:g} s; use a longer period or a shorter run, or a continuous "
+            "block in its place"
+        )
 
 
 def time_tolerance(first: float, last: float) -> float:
