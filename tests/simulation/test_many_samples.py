@@ -48,7 +48,5 @@ def test_a_discrete_system_whose_stored_values_need_too_much_memory():
     """At most 5e8 values, 1 state and 2 signals: a limit below 1e8 periods for 10 states."""
     n = 10
     wide = ct.ss(0.5 * np.eye(n), np.ones((n, 1)), np.ones((1, n)), 0, 1e-7)
-    with pytest.raises(
-        ValueError, match=r"at most 4.17e\+07 periods of a discrete system, got 1e\+08, since 12 states"
-    ):
+    with pytest.raises(ValueError, match=r"at most 4.17e\+07 periods of .*, got 1e\+08, since 12 states"):
         cp.simulate(wide, T, 1.0)
