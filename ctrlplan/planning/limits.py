@@ -795,12 +795,12 @@ class Limited:
         """Raise for a jump of a derivative that makes a limited signal infinite.
 
         The plan is at rest before its start and after its end, except if its speed
-        there is not 0: then it is the continuation of a motion.
+        there is not 0, up to rounding: then it is the continuation of a motion.
         """
         plan = self.seen(plan)
         highest = max((self.bounds[k].order for k in self._local), default=0)
-        jumps = plan.jumps(highest - 1) if highest else ()
-        moving = {t for t in (plan.start, plan.end) if jumps and plan.jet(t, 1, left=t > plan.start)[1].any()}
+        jumps = plan.jumps(max(1, highest - 1)) if highest else ()
+        moving = {jump.time for jump in jumps if jump.order == 1} & {plan.start, plan.end}
         for k in self._local if jumps else ():
             bound = self.bounds[k]
             axes = {plan.labels[signal.axis] for signal, _ in bound.terms if signal.axis is not None}

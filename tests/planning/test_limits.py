@@ -541,3 +541,19 @@ def test_quantities_keep_the_reason_of_a_rejected_jet():
     with pytest.raises(ValueError, match="quantities must accept jets") as info:
         margins(MOVE, {"effort": 1.0}, lambda jet: {"effort": jet[20, 0]})
     assert isinstance(info.value.__cause__, IndexError)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("end", [0, 1])
+def test_a_velocity_of_rounding_at_an_end_is_rest(end, size):
+    """The acceleration jumps there, so that the jerk is infinite; a plan that moves there continues a motion."""
+
+    def plan(velocity):
+        jets = [[0.0, 0.0, 0.0, 0.0], [size, 0.0, 0.0, 0.0]]
+        jets[end][1:3] = velocity, size
+        return cp.PolySpline([cp.Waypoint(k, *jet) for k, jet in enumerate(jets)])
+
+    for velocity in (0.0, 1e-17 * size, -1e-17 * size):
+        with pytest.raises(ValueError, match=rf"got y_d2 that jumps by .* at {end} s"):
+            cp.margins(plan(velocity), {"jerk": 1e9 * size})
+    assert cp.margins(plan(1e-3 * size), {"jerk": 1e9 * size}).satisfied
