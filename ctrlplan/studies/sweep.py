@@ -360,8 +360,8 @@ def sweep(
     The loop is sent to each worker once, a task has its values only. Values of a
     task whose worker ends are sent again, twice at most, one at a time, so that
     only the value that ends its worker has no result: see `Sweep.sent_again` and
-    `Sweep.missing`. A broken `concurrent.futures.ProcessPoolExecutor` is replaced
-    by one of the same size and start method. Nothing runs in this process
+    `Sweep.missing`. A broken process pool of `concurrent.futures` or loky is
+    replaced by one of the same size and start method. Nothing runs in this process
     instead. Results differ from those without an executor by rounding errors,
     1e-14 of the largest value.
 
