@@ -1,0 +1,258 @@
+"""Least-squares splines through samples, for many choices of their knots."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from ctrlplan.trajectories.common import Array
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
+
+_CORRECTIONS = 4
+"""Maximum number of corrections of a solution of the normal equations; one or two are usual."""
+
+_EPS = float(np.finfo(float).eps)
+
+_TOGETHER = 2**15
+"""Number of samples whose products are in memory at a time."""
+
+_CLEAR = 8
+"""Number of samples apart from any polynomial in an interval above which it is divided before the first solution."""
+
+
+class LeastSquares:
+    """Samples of all axes, through which splines with knots at some of the sample times are fitted.
+
+    Parameters
+    ----------
+    times : ndarray, shape (nsamples,)
+        Sample times, increasing.
+    rows : ndarray, shape (naxes, nsamples)
+        Samples.
+    degree : int
+        Degree of the splines.
+    """
+
+    def __init__(self, times: Array, rows: Array, degree: int) -> None:
+        self.times, self.rows, self.degree = times, rows, degree
+        self._precise = False
+
+    def knots(self, chosen: NDArray[np.intp]) -> Array:
+        """Knots at the chosen samples, those at both ends repeated."""
+        ends = [0] * self.degree, [self.times.size - 1] * self.degree
+        return self.times[np.concatenate([ends[0], chosen, ends[1]])]
+
+    def solve(self, chosen: NDArray[np.intp]) -> Solution:
+        """Spline with knots at the chosen samples.
+
+        By the normal equations, whose solution has half of the digits before its
+        correction; by scipy's QR decomposition, which takes up to fifty times as long,
+        for times that are spaced too unevenly for them.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the samples do not determine the spline.
+        """
+        if not self._precise:
+            try:
+                return Solution(self, chosen)
+            except np.linalg.LinAlgError:
+                self._precise = True
+        return QRSolution(self, chosen)
+
+    def corrected(self, solution: Solution) -> Solution:
+        """The same spline with all digits."""
+        if solution.correct():
+            return solution
+        self._precise = True
+        return QRSolution(self, solution.chosen)
+
+    def first_knots(self, limits: Array) -> NDArray[np.intp]:
+        """Samples at which knots are necessary to stay within limits (naxes,), nearly certainly.
+
+        The divided difference of a polynomial and degree + 2 samples is 0, and that of
+        independent errors is about as large as the root of the sum of their weights'
+        squares. Where it exceeds that of errors as large as the limits, a sample is
+        apart; an interval with many of them is divided in two, which the first
+        solutions would do in as many steps.
+        """
+        size, number = self.degree + 2, self.times.size - self.degree - 1
+        apart = np.zeros(self.times.size, dtype=np.intp)
+        with np.errstate(all="ignore"):
+            moments = (self.times - self.times[0]) * ((self.times.size - 1) / (self.times[-1] - self.times[0]))
+            windows = [slice(j, j + number) for j in range(size)]
+            weights = np.ones((size, number))
+            for j in range(size):
+                for i in range(j):
+                    gap = moments[windows[j]] - moments[windows[i]]
+                    weights[j] *= gap
+                    weights[i] *= -gap
+            weights = 1.0 / weights
+            scale = np.sqrt((weights**2).sum(axis=0))
+            for row, limit in zip(self.rows, limits.tolist(), strict=True):
+                difference = sum([weight * row[window] for weight, window in zip(weights, windows, strict=True)])
+                apart[size // 2 : size // 2 + number] |= np.abs(difference) > limit * scale
+        return np.array(_halved([0, *np.cumsum(apart).tolist()]))
+
+
+class Solution:
+    """Least-squares spline by the normal equations.
+
+    Attributes
+    ----------
+    chosen : ndarray of int
+        Samples at its knots.
+    coefficients : ndarray, shape (naxes, ncoefficients)
+        Of its B-splines.
+    deviations : ndarray, shape (naxes, nsamples)
+        Samples minus values.
+    is_correct : bool
+        Whether it has all digits.
+    """
+
+    is_correct = False
+
+    def __init__(self, problem: LeastSquares, chosen: NDArray[np.intp]) -> None:
+        self.chosen, self._problem = chosen, problem
+        degree, rows = problem.degree, problem.rows
+        count = chosen.size - 1
+        lengths = chosen[1:] - chosen[:-1]
+        lengths[-1] += 1
+        self._intervals = np.repeat(np.arange(count), lengths)
+        self._knots = problem.knots(chosen)
+        self._values = _basis(problem.times, self._knots, self._intervals, degree)
+        self._size = size = count + degree
+        values = self._values
+        total = np.zeros((degree + 1 + len(rows)) * size)
+        # Row d of the matrix and its diagonal d below the main one, in LAPACK's order, then the right sides.
+        places = [
+            [d * size + a for d in (*range(degree + 1 - a), *range(degree + 1, degree + 1 + len(rows)))]
+            for a in range(degree + 1)
+        ]
+        place = np.concatenate(places)[:, None]
+        for part in self._parts:
+            own = values[:, part]
+            others = np.concatenate([own, rows[:, part]])
+            products = np.concatenate([own[a] * others[a:] for a in range(degree + 1)])
+            index = place + self._intervals[part]
+            total += np.bincount(index.ravel(), products.ravel(), total.size)
+        bands, sides = np.split(total.reshape(-1, size), [degree + 1])
+        self._factor, info = lapack.dpbtrf(bands, lower=1)
+        if info:
+            raise np.linalg.LinAlgError("the normal equations are singular")
+        self.coefficients = self._solved(sides)
+        self.deviations = self._deviations()
+
+    @property
+    def _parts(self) -> list[slice]:
+        return [slice(k, k + _TOGETHER) for k in range(0, self._problem.times.size, _TOGETHER)]
+
+    def _solved(self, sides: Array) -> Array:
+        found, _ = lapack.dpbtrs(self._factor, sides.T, lower=1)
+        return np.ascontiguousarray(found.T)
+
+    def _deviations(self) -> Array:
+        found = self._problem.rows.copy()
+        for a, values in enumerate(self._values):
+            found -= values * self.coefficients[:, self._intervals + a]
+        return found
+
+    def correct(self) -> bool:
+        """Correct it by its deviations, whose own spline is 0; whether it has all digits then.
+
+        The errors decrease by one factor with each correction, the ratio of the last two.
+        """
+        size = before = np.abs(self.coefficients).max(axis=1)
+        for _ in range(_CORRECTIONS):
+            sides = [
+                sum(np.bincount(self._intervals + a, values * row, self._size) for a, values in enumerate(self._values))
+                for row in self.deviations
+            ]
+            change = self._solved(np.array(sides))
+            self.coefficients += change
+            self.deviations = self._deviations()
+            after = np.abs(change).max(axis=1)
+            if (after * after <= _EPS * size * before).all():
+                self.is_correct = True
+                return True
+            before = after
+        return False
+
+    def spline(self) -> BSpline:
+        """The spline of scipy."""
+        from scipy.interpolate import BSpline
+
+        return BSpline(self._knots, self.coefficients.T, self._problem.degree)
+
+
+class QRSolution(Solution):
+    """The same by the QR decomposition of scipy."""
+
+    is_correct = True
+
+    def __init__(self, problem: LeastSquares, chosen: NDArray[np.intp]) -> None:
+        from scipy.interpolate import make_lsq_spline
+
+        self.chosen = chosen
+        self._spline = make_lsq_spline(problem.times, problem.rows.T, problem.knots(chosen), k=problem.degree)
+        with np.errstate(over="ignore", invalid="ignore"):
+            self.deviations = problem.rows - self._spline(problem.times).T
+
+    def correct(self) -> bool:
+        """Nothing is left to be corrected."""
+        return True
+
+    def spline(self) -> BSpline:
+        """The spline of scipy."""
+        return self._spline
+
+
+def _halved(before: list[int]) -> list[int]:
+    """Ends of intervals, divided in two as long as more than `_CLEAR` samples in them are apart.
+
+    `before` is the number of these before each sample, and that of all.
+    """
+    found, ends = [0], [len(before) - 2]
+    while ends:
+        first, last = found[-1], ends[-1]
+        if before[last] - before[first] > _CLEAR:
+            ends.append((first + last) // 2)
+        else:
+            found.append(ends.pop())
+    return found
+
+
+def divided(chosen: NDArray[np.intp], parts: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Numbers of the samples at knots, with each interval divided into parts, but not between samples."""
+    lengths = chosen[1:] - chosen[:-1]
+    parts = np.minimum(parts, lengths)
+    count = int(parts.sum())
+    own = np.repeat(np.arange(parts.size), parts)
+    number = np.arange(count) - (np.cumsum(parts) - parts)[own]
+    inner = chosen[own] + number * lengths[own] // parts[own]
+    return np.append(inner, chosen[-1])
+
+
+def _basis(times: Array, knots: Array, intervals: NDArray[np.intp], degree: int) -> Array:
+    """Values (degree + 1, nsamples) of the B-splines that are not 0 in the interval of each sample.
+
+    By the recursion of Cox and de Boor, of all samples together.
+    """
+    found = np.empty((degree + 1, times.size))
+    found[0] = 1.0
+    steps = np.arange(degree)[:, None]
+    after = knots[intervals + (degree + 1 + steps)] - times
+    before = times - knots[intervals + (degree - steps)]
+    for d in range(1, degree + 1):
+        high, low = after[:d], before[d - 1 :: -1]
+        share = found[:d] / (high + low)
+        np.multiply(high, share, out=found[:d])
+        found[d] = 0.0
+        found[1 : d + 1] += low * share
+    return found
