@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_count, checked_vector, real_array
-from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers
+from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers, readonly
 from ctrlplan.trajectories.least_squares import LeastSquares, Solution, divided
 from ctrlplan.trajectories.piecewise_polynomial import PiecewisePolynomial
 from ctrlplan.trajectories.swing import MAXIMUM_SWING
@@ -126,7 +126,9 @@ def fit(
         splines = [_smooth(moments, row, degree, root) for row, root in zip(centred, roots.tolist(), strict=True)]
     else:
         splines = [_interpolating(moments, centred.T, degree)]
-    knots = np.unique(np.concatenate([spline.t for spline in splines]))
+    knots = splines[0].t[degree : splines[0].t.size - degree]
+    if len(splines) > 1:
+        knots = np.unique(np.concatenate([spline.t for spline in splines]))
     table = np.empty((degree + 1, knots.size - 1, len(rows)))
     for k in range(degree + 1):
         table[-1 - k] = np.concatenate([spline(knots[:-1], nu=k) for spline in splines], axis=1) / FACTORIALS[k]
@@ -140,7 +142,7 @@ def fit(
         with np.errstate(over="ignore"):
             found = np.where(sums > 0.0, (errors**2).sum(axis=1), 0.0)
         _refuse_missed("smoothing", "sum of squared deviations", found, sums, rows, splines)
-    plan = PiecewisePolynomial(knots, table, labels=labels, deviation=deviation)
+    plan = plan._with_fields(deviation=readonly(deviation))
     if warn:
         _warn_of_swing(plan, rows)
     return plan
@@ -300,13 +302,12 @@ def _within(times: Array, rows: Array, degree: int, limits: Array, *, mean: bool
     The limits are those of each sample or, with `mean`, of the root mean square.
     """
     problem = LeastSquares(times, rows, degree)
-    chosen = np.array([0, times.size - 1])
+    chosen, last = np.array([0, problem.places.size - 1]), problem.places.size - 1
     if not mean and limits.all():
         chosen = problem.first_knots(limits)
-    # As many coefficients as samples are those of the interpolating spline.
-    while chosen.size - 1 + degree < times.size and limits.all():
+    while chosen.size <= last and limits.all():  # all places are those of the interpolating spline
         try:
-            found = problem.solve(chosen)
+            found = problem.solve(problem.places[chosen])
             if chosen.size <= _MANY:
                 found = problem.corrected(found)
             worst, reached = _judged(found, limits, mean)
@@ -348,18 +349,18 @@ def _parts(chosen: NDArray[np.intp], worst: Array, degree: int) -> NDArray[np.in
     """
     several, exceeds = chosen[1:] - chosen[:-1] > 1, worst > 1.0
     wanted = np.minimum(np.maximum(np.ceil(worst ** (1.0 / (degree + 1))), 2.0), _PARTS)
-    parts, reach = np.where(exceeds, wanted, 1.0).astype(int), 1
-    while (waiting := exceeds & ~_near(several & (parts > 1), reach)).any():
-        parts = np.maximum(parts, _near(np.where(waiting, parts, 1), reach))
-        reach += 1
+    parts = np.where(exceeds, wanted, 1.0).astype(int)
+    active = exceeds & several
+    served = active.copy()
+    served[1:] |= active[:-1]
+    served[:-1] |= active[1:]
+    waiting = np.flatnonzero(exceeds & ~served)
+    if waiting.size:
+        numbers = np.arange(parts.size)
+        before = np.maximum.accumulate(np.where(several, numbers, -parts.size))[waiting]
+        after = np.minimum.accumulate(np.where(several, numbers, 2 * parts.size)[::-1])[::-1][waiting]
+        nearer = waiting - before <= after - waiting
+        np.maximum.at(parts, before[nearer], parts[waiting[nearer]])
+        nearer = waiting - before >= after - waiting
+        np.maximum.at(parts, after[nearer], parts[waiting[nearer]])
     return parts
-
-
-def _near(values: NDArray[Any], reach: int) -> NDArray[Any]:
-    """Maximum over the intervals at most `reach` away."""
-    for _ in range(reach):
-        found = values.copy()
-        np.maximum(found[1:], values[:-1], out=found[1:])
-        np.maximum(found[:-1], values[1:], out=found[:-1])
-        values = found
-    return values

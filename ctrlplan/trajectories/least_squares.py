@@ -21,8 +21,11 @@ _EPS = float(np.finfo(float).eps)
 _TOGETHER = 2**15
 """Number of samples whose products are in memory at a time."""
 
-_CLEAR = 8
-"""Number of samples apart from any polynomial in an interval above which it is divided before the first solution."""
+_CLEAR = 2
+"""Number of samples apart from any polynomial above which an interval is divided before the first solution."""
+
+_NEARLY = 0.95
+"""Part of the intervals that must have more, as those of samples with noise have."""
 
 
 class LeastSquares:
@@ -35,12 +38,25 @@ class LeastSquares:
     rows : ndarray, shape (naxes, nsamples)
         Samples.
     degree : int
-        Degree of the splines.
+        Degree of the splines, odd.
+
+    Attributes
+    ----------
+    places : ndarray of int
+        Samples at which there may be knots, all of which the interpolating spline has
+        (the condition not-a-knot): others near an end would make the equations ill-conditioned.
     """
 
     def __init__(self, times: Array, rows: Array, degree: int) -> None:
         self.times, self.rows, self.degree = times, rows, degree
         self._precise = False
+        half, last = (degree + 1) // 2, times.size - 1
+        self.places = np.concatenate([[0], np.arange(half, times.size - half), [last]])
+        # Products of a B-spline, its number in an interval, and one after it or a row of samples.
+        orders, count = range(degree + 1), degree + 1 + len(rows)
+        pairs = [(a, d) for a in orders for d in (*range(degree + 1 - a), *range(degree + 1, count))]
+        self.first, self.second = np.array(pairs).T[:, :, None]
+        self.starts = np.cumsum([0, *[count - a for a in orders]]).tolist()
 
     def knots(self, chosen: NDArray[np.intp]) -> Array:
         """Knots at the chosen samples, those at both ends repeated."""
@@ -74,16 +90,21 @@ class LeastSquares:
         return QRSolution(self, solution.chosen)
 
     def first_knots(self, limits: Array) -> NDArray[np.intp]:
-        """Samples at which knots are necessary to stay within limits (naxes,), nearly certainly.
+        """Places at even intervals that are still too long for limits (naxes,), nearly certainly.
 
-        The divided difference of a polynomial and degree + 2 samples is 0, and that of
-        independent errors is about as large as the root of the sum of their weights'
-        squares. Where it exceeds that of errors as large as the limits, a sample is
-        apart; an interval with many of them is divided in two, which the first
-        solutions would do in as many steps.
+        The divided difference of degree + 2 samples of a polynomial is 0, and that of
+        independent errors is about as large as the root of the sum of its weights'
+        squares. Where it exceeds that of errors as large as the limits, and the next one
+        has the other sign, as smooth signals have not, a sample is apart. If nearly all
+        intervals have several of them, all are divided in two, as the first solutions
+        would do, one step each.
         """
+        count, last = 1, self.places.size - 1
+        chosen = even = np.array([0, last])
         size, number = self.degree + 2, self.times.size - self.degree - 1
-        apart = np.zeros(self.times.size, dtype=np.intp)
+        if number <= _CLEAR:
+            return chosen
+        apart = np.zeros(number - 1, dtype=np.bool_)
         with np.errstate(all="ignore"):
             moments = (self.times - self.times[0]) * ((self.times.size - 1) / (self.times[-1] - self.times[0]))
             windows = [slice(j, j + number) for j in range(size)]
@@ -97,8 +118,14 @@ class LeastSquares:
             scale = np.sqrt((weights**2).sum(axis=0))
             for row, limit in zip(self.rows, limits.tolist(), strict=True):
                 difference = sum([weight * row[window] for weight, window in zip(weights, windows, strict=True)])
-                apart[size // 2 : size // 2 + number] |= np.abs(difference) > limit * scale
-        return np.array(_halved([0, *np.cumsum(apart).tolist()]))
+                difference = difference / scale
+                apart |= (np.abs(difference[1:]) > limit) & (difference[1:] * difference[:-1] < 0.0)
+        before = np.zeros(self.places.size, dtype=np.intp)
+        np.cumsum(apart, out=before[-apart.size :])
+        while np.count_nonzero(before[even[1:]] - before[even[:-1]] > _CLEAR) >= _NEARLY * count:
+            chosen, count = even, 2 * count
+            even = np.arange(count + 1) * last // count
+        return chosen
 
 
 class Solution:
@@ -130,17 +157,13 @@ class Solution:
         self._size = size = count + degree
         values = self._values
         total = np.zeros((degree + 1 + len(rows)) * size)
-        # Row d of the matrix and its diagonal d below the main one, in LAPACK's order, then the right sides.
-        places = [
-            [d * size + a for d in (*range(degree + 1 - a), *range(degree + 1, degree + 1 + len(rows)))]
-            for a in range(degree + 1)
-        ]
-        place = np.concatenate(places)[:, None]
+        # Row d of the matrix is its diagonal d below the main one, as in LAPACK; the right sides follow.
+        place, starts = problem.second * size + problem.first, problem.starts
         for part in self._parts:
-            own = values[:, part]
-            others = np.concatenate([own, rows[:, part]])
-            products = np.concatenate([own[a] * others[a:] for a in range(degree + 1)])
-            index = place + self._intervals[part]
+            own, index = values[:, part], place + self._intervals[part]
+            others, products = np.concatenate([own, rows[:, part]]), np.empty(index.shape)
+            for a, value in enumerate(own):
+                np.multiply(value, others[a:], out=products[starts[a] : starts[a + 1]])
             total += np.bincount(index.ravel(), products.ravel(), total.size)
         bands, sides = np.split(total.reshape(-1, size), [degree + 1])
         self._factor, info = lapack.dpbtrf(bands, lower=1)
@@ -211,21 +234,6 @@ class QRSolution(Solution):
     def spline(self) -> BSpline:
         """The spline of scipy."""
         return self._spline
-
-
-def _halved(before: list[int]) -> list[int]:
-    """Ends of intervals, divided in two as long as more than `_CLEAR` samples in them are apart.
-
-    `before` is the number of these before each sample, and that of all.
-    """
-    found, ends = [0], [len(before) - 2]
-    while ends:
-        first, last = found[-1], ends[-1]
-        if before[last] - before[first] > _CLEAR:
-            ends.append((first + last) // 2)
-        else:
-            found.append(ends.pop())
-    return found
 
 
 def divided(chosen: NDArray[np.intp], parts: NDArray[np.intp]) -> NDArray[np.intp]:
