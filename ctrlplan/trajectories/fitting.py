@@ -18,7 +18,7 @@ from ctrlplan.trajectories.swing import MAXIMUM_SWING
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
 
-_MANY = 100
+_MANY = 50
 """Number of knots above which they are chosen by solutions with half of the digits."""
 
 _DEGREES = (1, 3, 3, 5, 5)

@@ -21,11 +21,8 @@ _EPS = float(np.finfo(float).eps)
 _TOGETHER = 2**15
 """Number of samples whose products are in memory at a time."""
 
-_CLEAR = 2
-"""Number of samples apart from any polynomial above which an interval is divided before the first solution."""
-
-_NEARLY = 0.95
-"""Part of the intervals that must have more, as those of samples with noise have."""
+_NEARLY = 0.9
+"""Part of the intervals with samples apart from any polynomial from which on all are divided at first."""
 
 
 class LeastSquares:
@@ -96,13 +93,13 @@ class LeastSquares:
         independent errors is about as large as the root of the sum of its weights'
         squares. Where it exceeds that of errors as large as the limits, and the next one
         has the other sign, as smooth signals have not, a sample is apart. If nearly all
-        intervals have several of them, all are divided in two, as the first solutions
+        intervals have one, all are divided in two, as the first solutions
         would do, one step each.
         """
         count, last = 1, self.places.size - 1
         chosen = even = np.array([0, last])
         size, number = self.degree + 2, self.times.size - self.degree - 1
-        if number <= _CLEAR:
+        if number < 2:
             return chosen
         apart = np.zeros(number - 1, dtype=np.bool_)
         with np.errstate(all="ignore"):
@@ -122,7 +119,7 @@ class LeastSquares:
                 apart |= (np.abs(difference[1:]) > limit) & (difference[1:] * difference[:-1] < 0.0)
         before = np.zeros(self.places.size, dtype=np.intp)
         np.cumsum(apart, out=before[-apart.size :])
-        while np.count_nonzero(before[even[1:]] - before[even[:-1]] > _CLEAR) >= _NEARLY * count:
+        while np.count_nonzero(before[even[1:]] > before[even[:-1]]) >= _NEARLY * count:
             chosen, count = even, 2 * count
             even = np.arange(count + 1) * last // count
         return chosen
@@ -183,7 +180,7 @@ class Solution:
     def _deviations(self) -> Array:
         found = self._problem.rows.copy()
         for a, values in enumerate(self._values):
-            found -= values * self.coefficients[:, self._intervals + a]
+            found -= values * self.coefficients.take(self._intervals + a, axis=1)
         return found
 
     def correct(self) -> bool:
@@ -255,8 +252,9 @@ def _basis(times: Array, knots: Array, intervals: NDArray[np.intp], degree: int)
     found = np.empty((degree + 1, times.size))
     found[0] = 1.0
     steps = np.arange(degree)[:, None]
-    after = knots[intervals + (degree + 1 + steps)] - times
-    before = times - knots[intervals + (degree - steps)]
+    after = knots.take(intervals + (degree + 1 + steps))
+    after -= times
+    before = times - knots.take(intervals + (degree - steps))
     for d in range(1, degree + 1):
         high, low = after[:d], before[d - 1 :: -1]
         share = found[:d] / (high + low)
