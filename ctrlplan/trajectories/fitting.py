@@ -50,7 +50,8 @@ def fit(
     With `tolerance` it is a least-squares spline (`make_lsq_spline`) whose knots, the
     same for all axes, are added where the deviation is larger. With `smoothing` it is,
     axis by axis, the smoothing spline of FITPACK (`splrep`) or, of continuity 0, a
-    least-squares spline with knots added until the sum is met. Knots are sample times.
+    least-squares spline with knots added until the sum is met. Knots are sample times,
+    at both ends as those of the interpolating spline (not-a-knot).
 
     Parameters
     ----------
