@@ -308,13 +308,14 @@ def _within(times: Array, rows: Array, degree: int, limits: Array, *, mean: bool
         chosen = problem.first_knots(limits)
     while chosen.size <= last and limits.all():  # all places are those of the interpolating spline
         try:
-            found = problem.solve(problem.places[chosen])
-            if chosen.size <= _MANY:
-                found = problem.corrected(found)
-            worst, reached = _judged(found, limits, mean)
-            if not found.is_correct and (reached or not np.isfinite(worst).all()):  # these are the knots
-                found = problem.corrected(found)
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = problem.solve(problem.places[chosen])
+                if chosen.size <= _MANY:
+                    found = problem.corrected(found)
                 worst, reached = _judged(found, limits, mean)
+                if not found.is_correct and (reached or not np.isfinite(worst).all()):  # these are the knots
+                    found = problem.corrected(found)
+                    worst, reached = _judged(found, limits, mean)
         except np.linalg.LinAlgError:
             break
         if reached:
@@ -327,10 +328,9 @@ def _within(times: Array, rows: Array, degree: int, limits: Array, *, mean: bool
 
 def _judged(found: Solution, limits: Array, mean: bool) -> tuple[Array, bool]:
     """Deviation of each interval relative to the limits, and whether they are kept."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        excess = (np.abs(found.deviations) / (limits * (1.0 - _ROUNDING))[:, None]).max(axis=0)
-        worst = _by_interval(excess, found.chosen, mean)
-        return worst, bool((worst <= 1.0).all() or (mean and (excess**2).mean() <= 1.0))
+    excess = (np.abs(found.deviations) / (limits * (1.0 - _ROUNDING))[:, None]).max(axis=0)
+    worst = _by_interval(excess, found.chosen, mean)
+    return worst, bool((worst <= 1.0).all() or (mean and (excess**2).mean() <= 1.0))
 
 
 def _by_interval(excess: Array, chosen: NDArray[np.intp], mean: bool) -> Array:

@@ -397,6 +397,18 @@ def test_few_samples_for_the_frequency_are_followed_to_the_ends(continuity, half
     assert np.abs(plan(np.linspace(t[0], t[-1], 5001))).max() <= 2.0
 
 
+@pytest.mark.parametrize("continuity", [0, 2, 4])
+def test_overflow_of_a_fit_is_an_error_and_no_warning(continuity):
+    t = np.linspace(0.0, 10.0, 500)
+    values = 5e306 * (np.sin(t) + 1e-3 * np.random.default_rng(0).normal(size=t.size))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ValueError, match="coefficients must be finite"):
+            cp.fit(t, values, tolerance=1e304, continuity=continuity)
+        small = cp.fit(t, values / 1e300, tolerance=1e4, continuity=continuity)
+    assert np.abs(small(t) - values / 1e300).max() <= 1e4
+
+
 @pytest.mark.parametrize("size", [6, 7, 8, 9, 12])
 def test_tolerances_of_few_samples(size):
     values = np.random.default_rng(size).normal(size=size)
