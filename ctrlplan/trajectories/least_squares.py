@@ -198,7 +198,7 @@ class Solution:
             self.coefficients += change
             self.deviations = self._deviations()
             after = np.abs(change).max(axis=1)
-            if (after * after <= _EPS * size * before).all():
+            if (after <= _EPS**0.5 * np.sqrt(size) * np.sqrt(before)).all():  # products may underflow
                 self.is_correct = True
                 return True
             before = after
