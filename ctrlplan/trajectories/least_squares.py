@@ -220,7 +220,11 @@ class QRSolution(Solution):
         from scipy.interpolate import make_lsq_spline
 
         self.chosen = chosen
-        self._spline = make_lsq_spline(problem.times, problem.rows.T, problem.knots(chosen), k=problem.degree)
+        knots = problem.knots(chosen)
+        try:
+            self._spline = make_lsq_spline(problem.times, problem.rows.T, knots, k=problem.degree)
+        except ValueError as error:  # scipy 1.14, which solves normal equations here, of an overflow
+            raise np.linalg.LinAlgError(str(error)) from error
         with np.errstate(over="ignore", invalid="ignore"):
             self.deviations = problem.rows - self._spline(problem.times).T
 

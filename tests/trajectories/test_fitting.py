@@ -419,6 +419,7 @@ def test_tolerances_of_few_samples(size):
             assert np.abs(plan(np.arange(size)) - values).max() <= tolerance
 
 
+@pytest.mark.skipif(not hasattr(si, "generate_knots"), reason="least squares by QR came with scipy 1.15")
 def test_rounding_of_a_least_squares_spline_is_not_said_to_be_of_all_samples():
     """Quintics with large coefficients between pairs of near samples, and few knots in a long constant part."""
     times = np.append(np.ravel([(k, k + 1e-9) for k in range(10)]), np.linspace(11.0, 20.0, 91))
