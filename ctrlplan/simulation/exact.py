@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from scipy.linalg import matrix_balance, pascal
 
 from ctrlplan._types import Array
+from ctrlplan.simulation.exponential import MANY_STATES, changes_of_many
 from ctrlplan.simulation.pairs import pair_product, pair_sum
 
 _TERMS = 18
@@ -378,6 +379,10 @@ def changes_over(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Arr
     """
     if a.ndim == 2:
         return [change[0] for change in changes_over(a[None], b[None], nterms, halvings)]
+    if len(a) == 1 and a.shape[1] >= MANY_STATES and nterms <= 2 and not halvings:
+        own = changes_of_many(a[0], b[0], nterms)
+        if own is not None:
+            return [change[None] for change in own]
     products, minimum = _products(a, b)
     levels = max(halvings, int(minimum.max()))
     found = _doubled(products, minimum, nterms, levels)
