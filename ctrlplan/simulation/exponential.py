@@ -64,9 +64,7 @@ def changes_of_many(a: Array, b: Array, nterms: int) -> list[Array] | None:
     changes = [_short(np.concatenate([a, b, np.zeros((n, (nterms - 1) * m))], axis=1) * 0.5**halvings, n, m)]
     for _ in range(halvings):
         before = changes[-1]
-        after = before[:, :n] @ before
-        after += before
-        after += before
+        after = doubled(before)
         if nterms == 2:  # the second term of the input begins at its value in the middle
             after[:, n + m :] += before[:, n : n + m]
             after[:, n + m :] *= 0.5
@@ -74,6 +72,20 @@ def changes_of_many(a: Array, b: Array, nterms: int) -> list[Array] | None:
             return None
         changes.append(after)
     return changes if np.isfinite(changes[-1]).all() else None
+
+
+def short_change(a: Array) -> Array:
+    """exp(a) - 1 for a norm of at most 1, by the polynomial and at most one square."""
+    halvings = int(_norm(a) > _REACH)
+    found = _short(a * 0.5**halvings, len(a), 0)
+    return doubled(found) if halvings else found
+
+
+def doubled(change: Array) -> Array:
+    """Twice a change (n, n + ...) and its product with itself, in one product of matrices."""
+    left = change[:, : len(change)].copy()  # aligned rows are faster
+    np.einsum("ii->i", left)[:] += 2.0
+    return np.asarray(left @ change)
 
 
 def _short(a: Array, n: int, m: int) -> Array:
@@ -101,9 +113,11 @@ def _short(a: Array, n: int, m: int) -> Array:
 
 def cancels(left: Array, right: Array, result: Array) -> bool:
     """Whether a product of matrices has terms much larger than factors and result, and than 1."""
-    size = _CANCELLED * max(float(np.abs(matrix).max(initial=1.0)) for matrix in (left, right, result))
     # By the inequality of Cauchy and Schwarz, before the product of magnitudes.
-    rows, columns = np.einsum("ij,ij->i", left, left).max(initial=0.0), np.einsum("ij,ij->j", right, right).max(initial=0.0)
+    rows, columns = (left * left).sum(axis=1).max(initial=0.0), (right * right).sum(axis=0).max(initial=0.0)
+    if rows * columns <= _CANCELLED**2:
+        return False
+    size = _CANCELLED * max(float(np.abs(matrix).max(initial=1.0)) for matrix in (left, right, result))
     return not rows * columns <= size**2 and not (np.abs(left) @ np.abs(right)).max() <= size
 
 
