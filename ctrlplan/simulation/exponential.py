@@ -68,7 +68,8 @@ def changes_of_many(a: Array, b: Array, nterms: int) -> list[Array] | None:
         if nterms == 2:  # the second term of the input begins at its value in the middle
             after[:, n + m :] += before[:, n : n + m]
             after[:, n + m :] *= 0.5
-        if cancels(before[:, :n], before[:, :n], after[:, :n]):
+        own = before[:, :n]
+        if cancels(own, own, after[:, :n]):
             return None
         changes.append(after)
     return changes if np.isfinite(changes[-1]).all() else None
@@ -114,7 +115,9 @@ def _short(a: Array, n: int, m: int) -> Array:
 def cancels(left: Array, right: Array, result: Array) -> bool:
     """Whether a product of matrices has terms much larger than factors and result, and than 1."""
     # By the inequality of Cauchy and Schwarz, before the product of magnitudes.
-    rows, columns = (left * left).sum(axis=1).max(initial=0.0), (right * right).sum(axis=0).max(initial=0.0)
+    squares = left * left
+    rows = squares.sum(axis=1).max(initial=0.0)
+    columns = (squares if right is left else right * right).sum(axis=0).max(initial=0.0)
     if rows * columns <= _CANCELLED**2:
         return False
     size = _CANCELLED * max(float(np.abs(matrix).max(initial=1.0)) for matrix in (left, right, result))
@@ -122,5 +125,5 @@ def cancels(left: Array, right: Array, result: Array) -> bool:
 
 
 def _norm(a: Array) -> float:
-    """Largest sum of magnitudes in a column."""
-    return float(np.abs(a).sum(axis=0).max(initial=0.0))
+    """The smaller of two norms: the largest sum of magnitudes in a column, and the root of the sum of squares."""
+    return min(float(np.abs(a).sum(axis=0).max(initial=0.0)), float(np.vdot(a, a)) ** 0.5)

@@ -47,7 +47,15 @@ Values = Callable[[Array], Array]
 """Maps times (n,) that are no breakpoints to the input (ninputs, n)."""
 
 
-def moment_states(a: Array, b: Array, values: Values, marks: Array, timepts: Array, initial: Array) -> Array | None:
+def moment_states(
+    a: Array,
+    b: Array,
+    values: Values,
+    marks: Array,
+    timepts: Array,
+    initial: Array,
+    scale: Array | None = None,
+) -> Array | None:
     """States of x' = a x + b w at evenly spaced sample times.
 
     Parameters
@@ -62,6 +70,8 @@ def moment_states(a: Array, b: Array, values: Values, marks: Array, timepts: Arr
         Sample times [s], increasing.
     initial : ndarray, shape (nstates,)
         State at the first of them.
+    scale : ndarray, shape (nstates,), optional
+        Balancing scale of the system matrix, if it is known.
 
     Returns
     -------
@@ -71,7 +81,7 @@ def moment_states(a: Array, b: Array, values: Values, marks: Array, timepts: Arr
     """
     first, last = float(timepts[0]), float(timepts[-1])
     sample = spacing(timepts - first, last - first)
-    scale = state_scale(a)
+    scale = state_scale(a) if scale is None else scale
     a, b, state = a * (scale / scale[:, None]), b / scale[:, None], initial / scale
     norm = float(np.abs(a).sum(axis=0).max(initial=0.0))
     if not sample or not np.isfinite(norm):
@@ -110,70 +120,184 @@ class _Level:
     ----------
     whole : ndarray of bool, shape (nsteps,)
         Whether a step is not halved.
-    inputs : ndarray, shape (nwhole, nodes * ninputs) or (nwhole, nmoments * ninputs)
-        Legendre coefficients of the inputs in those; at the last level their moments.
+    inputs : ndarray, shape (nwhole, nnodes * ninputs)
+        Legendre coefficients of the inputs in those.
     """
 
     whole: NDArray[np.bool_]
     inputs: Array
 
 
-def _cells(values: Values, marks: Array, first: float, sample: float, count: int, levels: int) -> list[_Level] | None:
-    """Steps of each level, from samples to the shortest; None if they are too many, or inputs are not resolved."""
+@dataclass(frozen=True)
+class _Cells:
+    """Steps of all levels, from samples to the shortest.
+
+    Attributes
+    ----------
+    levels : list of _Level
+        The steps.
+    moments : ndarray, shape (nsteps, nmoments * ninputs)
+        Moments of the inputs over the shortest steps that are not whole.
+    """
+
+    levels: list[_Level]
+    moments: Array
+
+
+def _cells(values: Values, marks: Array, first: float, sample: float, count: int, levels: int) -> _Cells | None:
+    """Steps of each level; None if they are too many, or inputs are not resolved."""
     end = first + sample * count
     tolerance = 4.0 * np.finfo(float).eps * max(abs(first), abs(end))
     marks = marks[(marks > first + tolerance) & (marks < end - tolerance)]
-    which, size, found = np.arange(count), None, []
-    for level in range(levels):
-        step = sample * 0.5**level
-        starts, ends = first + step * which, first + step * (which + 1)
-        inside = np.searchsorted(marks, ends - tolerance) > np.searchsorted(marks, starts + tolerance, side="right")
-        some = ~inside if found else np.ones(which.size, dtype=bool)  # the size of inputs from all steps
-        w = values((starts[some, None] + step * gauss_nodes(_NODES)).ravel())
-        w = w.reshape(len(w), np.count_nonzero(some), _NODES)
-        size = np.abs(w).max(axis=(1, 2), initial=0.0) if size is None else size
-        coefficients = w @ to_legendre(_NODES).T
-        resolved = _resolved(coefficients, size) & ~inside[some]
-        whole = some.copy()
-        whole[some] = resolved
-        own = coefficients[:, resolved].transpose(1, 2, 0)
-        found.append(_Level(whole, own.reshape(len(own), _NODES * len(w))))
-        which = (2 * which[~whole, None] + [0, 1]).ravel()
-        if which.size > _STEPS or step < 1e3 * tolerance:
+    if levels and sample * 0.5**levels < 1e3 * tolerance:
+        return None
+    split = [np.zeros(0, dtype=np.intp) for _ in range(levels)]  # steps in which inputs are not resolved
+    while True:
+        steps, rest = _halved_steps(marks, (first, sample, tolerance), count, split, levels)
+        if max(which.size for which, _ in steps) > _STEPS:
             return None
-    if size is not None and not which.size:
-        return [*found, _Level(np.ones(0, dtype=bool), np.zeros((0, _MOMENTS * size.size)))]
-    moments = _moments(values, marks, first, sample * 0.5**levels, which, tolerance, size)
-    return None if moments is None else [*found, _Level(np.ones(which.size, dtype=bool), moments)]
+        ends = [
+            (first + s * which[whole], s) for s, (which, whole) in zip(_lengths(sample, levels), steps, strict=True)
+        ]
+        parts = _Parts.of(marks, rest, (first, sample * 0.5**levels, tolerance))
+        starts = np.concatenate([*(start for start, _ in ends), parts.starts])
+        spans = np.concatenate([*(np.full(start.size, s) for start, s in ends), parts.ends - parts.starts])
+        arranged = np.argsort(starts, kind="stable")  # one call with increasing times is much faster
+        w = values((starts[arranged, None] + spans[arranged, None] * gauss_nodes(_NODES)).ravel())
+        inputs = np.empty((starts.size, len(w), _NODES))
+        inputs[arranged] = w.reshape(len(w), -1, _NODES).transpose(1, 0, 2)
+        coefficients = inputs @ to_legendre(_NODES).T
+        size = np.abs(inputs).max(axis=(0, 2), initial=0.0)
+        places = np.cumsum([start.size for start, _ in ends])
+        again = False
+        for level, (own, (which, whole)) in enumerate(
+            zip(np.split(coefficients, places)[:levels], steps, strict=False)
+        ):
+            unresolved = which[whole][~_resolved(own, size)]
+            split[level], again = np.union1d(split[level], unresolved), again or unresolved.size > 0
+        if not again:
+            break
+    shortest = coefficients[places[levels - 1] if levels else 0 :]
+    if not _resolved(np.abs(shortest).max(axis=0, keepdims=True, initial=0.0), size).all():
+        return None
+    found = [
+        _Level(whole, own.transpose(0, 2, 1).reshape(len(own), _NODES * size.size))
+        for own, (_, whole) in zip(np.split(coefficients, places)[:-1], steps, strict=True)
+    ]
+    return _Cells(found, parts.moments(inputs[places[-1] :]))
 
 
-def _forced(cells: list[_Level], changes: list[Array], responses: Array) -> Array:
+def _lengths(sample: float, levels: int) -> list[float]:
+    """Lengths of the steps of all levels."""
+    return [sample * 0.5**level for level in range(levels + 1)]
+
+
+def _halved_steps(
+    marks: Array, grid: tuple[float, float, float], count: int, split: list[NDArray[np.intp]], levels: int
+) -> tuple[list[tuple[NDArray[np.intp], NDArray[np.bool_]]], NDArray[np.intp]]:
+    """Numbers of the steps of each level and whether they are whole, and the shortest ones with marks inside.
+
+    The grid consists of its first time, the sample spacing and the rounding errors of times.
+    """
+    first, sample, tolerance = grid
+    which, found = np.arange(count), []
+    for level, step in enumerate(_lengths(sample, levels)):
+        starts, ends = first + step * which, first + step * (which + 1)
+        whole = np.searchsorted(marks, ends - tolerance) <= np.searchsorted(marks, starts + tolerance, side="right")
+        if level < levels and split[level].size:
+            whole &= ~np.isin(which, split[level])
+        found.append((which, whole))
+        rest = which[~whole]
+        which = np.stack([2 * rest, 2 * rest + 1], axis=1).ravel()
+    return found, rest
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Parts of the shortest steps between marks.
+
+    Attributes
+    ----------
+    starts, ends : ndarray, shape (nparts,)
+        Their first and last times [s].
+    owner : ndarray of int, shape (nparts,)
+        Index of the step of each, increasing.
+    stops : ndarray, shape (nsteps,)
+        Last times [s] of the steps.
+    step : float
+        Length of a step [s].
+    """
+
+    starts: Array
+    ends: Array
+    owner: NDArray[np.intp]
+    stops: Array
+    step: float
+
+    @classmethod
+    def of(cls, marks: Array, which: NDArray[np.intp], grid: tuple[float, float, float]) -> _Parts:
+        """Parts of steps of a grid; it consists of its first time, the length of a step and the errors of times."""
+        first, step, tolerance = grid
+        begins: Array = first + step * which
+        stops: Array = first + step * (which + 1)
+        if not which.size:
+            return cls(begins, stops, which, stops, step)
+        near = np.searchsorted(begins, marks, side="right") - 1
+        off = (near >= 0) & (marks > begins[near] + tolerance) & (marks < stops[near] - tolerance)
+        starts, owner = np.concatenate([begins, marks[off]]), np.concatenate([np.arange(which.size), near[off]])
+        arranged = np.lexsort((starts, owner))
+        starts, owner = starts[arranged], owner[arranged]
+        ends = np.where(np.append(owner[1:] != owner[:-1], True), stops[owner], np.append(starts[1:], 0.0))
+        return cls(starts, ends, owner, stops, step)
+
+    def moments(self, inputs: Array) -> Array:
+        """Moments (nsteps, nmoments * ninputs) over the steps of inputs (nparts, ninputs, nnodes)."""
+        count, m = self.starts.size, inputs.shape[1]
+        if not count:
+            return np.zeros((0, _MOMENTS * m))
+        times = self.starts[:, None] + (self.ends - self.starts)[:, None] * gauss_nodes(_NODES)
+        sigma = (self.stops[self.owner][:, None] - times) / self.step
+        factor = (self.ends - self.starts)[:, None] / self.step * (0.5 * legendre.leggauss(_NODES)[1])
+        found = np.empty((count, _MOMENTS, m))
+        for i in range(_MOMENTS):
+            np.einsum("kf,kmf->km", factor, inputs, out=found[:, i])
+            factor *= sigma
+            factor /= i + 1.0
+        total = np.add.reduceat(found, np.searchsorted(self.owner, np.arange(self.stops.size)), axis=0)
+        return total.reshape(self.stops.size, -1)
+
+
+def _forced(cells: _Cells, changes: list[Array], responses: Array) -> Array:
     """Responses (nsteps, n) to the inputs over each sample step, from the shortest steps upwards."""
-    n = len(changes[0])
-    forced = cells[-1].inputs @ responses
-    # Responses (nodes, ninputs * n) to Legendre polynomials over a step, and those over its halves.
-    kernel = (_moments_of_legendre() @ responses.reshape(_MOMENTS, -1)) if len(cells) > 1 else np.empty(0)
+    n = responses.shape[1]
+    # Responses (nnodes, ninputs * n) to Legendre polynomials over a step, and those over its halves.
+    kernel = _moments_of_legendre() @ responses.reshape(_MOMENTS, -1)
     early, late = _halves()
-    for level, change in zip(cells[-2::-1], changes[:0:-1], strict=True):
-        first = kernel.reshape(-1, n)
-        first = first + first @ change.T
-        kernel = early @ first.reshape(_NODES, -1) + late @ kernel
-        both = np.empty((level.whole.size, n))
-        both[level.whole] = level.inputs @ kernel.reshape(-1, n)
-        left, right = forced[0::2], forced[1::2]
-        both[~level.whole] = left + left @ change.T + right
-        forced = both
+    forced = cells.moments @ responses
+    for number in range(len(cells.levels) - 1, -1, -1):
+        level = cells.levels[number]
+        if number < len(changes) - 1:
+            change = changes[number + 1].T
+            first = kernel.reshape(-1, n)
+            first = first + first @ change
+            kernel = early @ first.reshape(_NODES, -1) + late @ kernel
+            left, right = forced[0::2], forced[1::2]
+            forced = left + left @ change + right
+        own = level.inputs @ kernel.reshape(-1, n)
+        if forced.size:
+            both = np.empty((level.whole.size, n))
+            both[level.whole], both[~level.whole] = own, forced
+            own = both
+        forced = own
     return forced
 
 
 @lru_cache(maxsize=1)
 def _moments_of_legendre() -> Array:
-    """Moments of Legendre polynomials over a step, shape (nodes, nmoments)."""
-    weights = 0.5 * legendre.leggauss(_NODES)[1]
-    nodes = gauss_nodes(_NODES)
-    powers = np.cumprod(
-        np.concatenate([np.ones((1, _NODES)), (1.0 - nodes) / np.arange(1.0, _MOMENTS)[:, None]]), axis=0
-    )
+    """Moments of Legendre polynomials over a step, shape (nnodes, nmoments)."""
+    nodes, weights = gauss_nodes(_NODES), 0.5 * legendre.leggauss(_NODES)[1]
+    factors = (1.0 - nodes) / np.arange(1.0, _MOMENTS)[:, None]
+    powers = np.cumprod(np.concatenate([np.ones((1, _NODES)), factors]), axis=0)
     return np.asarray((legendre.legvander(2.0 * nodes - 1.0, _NODES - 1) * weights[:, None]).T @ powers.T)
 
 
@@ -193,44 +317,8 @@ def _responses(a: Array, b: Array) -> Array:
     return np.concatenate([term.T for term in terms])
 
 
-def _moments(
-    values: Values,
-    marks: Array,
-    first: float,
-    step: float,
-    which: NDArray[np.intp],
-    tolerance: float,
-    size: Array | None,
-) -> Array | None:
-    """Moments (nsteps, nmoments * ninputs) of the inputs over steps; None if they are not resolved."""
-    begins, stops = first + step * which, first + step * (which + 1)
-    near = np.searchsorted(begins, marks, side="right") - 1
-    off = (near >= 0) & (marks > begins[near] + tolerance) & (marks < stops[near] - tolerance)
-    starts, owner = np.concatenate([begins, marks[off]]), np.concatenate([np.arange(which.size), near[off]])
-    order = np.lexsort((starts, owner))
-    starts, owner = starts[order], owner[order]
-    ends = np.where(np.append(owner[1:] != owner[:-1], True), stops[owner], np.append(starts[1:], 0.0))
-    nodes, weights = gauss_nodes(_NODES), 0.5 * legendre.leggauss(_NODES)[1]
-    times = starts[:, None] + (ends - starts)[:, None] * nodes
-    w = values(times.ravel())
-    w = w.reshape(len(w), *times.shape)
-    size = np.abs(w).max(axis=(1, 2), initial=0.0) if size is None else size
-    coefficients = np.abs(w @ to_legendre(_NODES).T)
-    if not _resolved(coefficients.max(axis=1, keepdims=True, initial=0.0), size).all():
-        return None
-    sigma = (stops[owner][:, None] - times) / step
-    factor = (ends - starts)[:, None] / step * weights
-    found = np.empty((starts.size, _MOMENTS, len(w)))
-    for i in range(_MOMENTS):
-        found[:, i] = np.einsum("kf,mkf->km", factor, w)
-        factor = factor * sigma / (i + 1.0)
-    total = np.add.reduceat(found, np.searchsorted(owner, np.arange(which.size)), axis=0)
-    return total.reshape(which.size, -1)
-
-
 def _resolved(coefficients: Array, size: Array) -> NDArray[np.bool_]:
-    """Whether inputs (nparts,) are resolved by Legendre coefficients (ninputs, nparts, nodes), to rounding."""
+    """Whether inputs are resolved in parts (nparts,) by coefficients (nparts, ninputs, nnodes), to rounding."""
     high = np.abs(coefficients[:, :, _NODES // 2 :])
     last, middle = high[:, :, -2:].max(axis=2), high[:, :, :-2].max(axis=2)
-    limit = size[:, None]
-    return np.asarray(((last <= _RESOLVED * limit) | ((last <= _NOISE * limit) & (last > 0.01 * middle))).all(axis=0))
+    return np.asarray(((last <= _RESOLVED * size) | ((last <= _NOISE * size) & (last > 0.01 * middle))).all(axis=1))
