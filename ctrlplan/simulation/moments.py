@@ -238,8 +238,8 @@ class _Parts:
     def of(cls, marks: Array, which: NDArray[np.intp], grid: tuple[float, float, float]) -> _Parts:
         """Parts of steps of a grid; it consists of its first time, the length of a step and the errors of times."""
         first, step, tolerance = grid
-        begins: Array = first + step * which
-        stops: Array = first + step * (which + 1)
+        begins = np.asarray(first + step * which, dtype=float)
+        stops = np.asarray(first + step * (which + 1), dtype=float)
         if not which.size:
             return cls(begins, stops, which, stops, step)
         near = np.searchsorted(begins, marks, side="right") - 1
