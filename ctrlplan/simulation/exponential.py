@@ -55,6 +55,12 @@ def changes_of_many(a: Array, b: Array, nterms: int) -> list[Array] | None:
         None if the norms of powers are much smaller than the powers of the norm, squares
         have cancellation, or numbers overflow.
     """
+    with np.errstate(all="ignore"):
+        return _of_many(a, b, nterms)
+
+
+def _of_many(a: Array, b: Array, nterms: int) -> list[Array] | None:
+    """The same, for numbers that may overflow."""
     n, m = b.shape
     norm, square = _norm(a), a @ a
     root = _norm(square) ** 0.5
@@ -121,7 +127,7 @@ def cancels(left: Array, right: Array, result: Array) -> bool:
     if rows * columns <= _CANCELLED**2:
         return False
     size = _CANCELLED * max(float(np.abs(matrix).max(initial=1.0)) for matrix in (left, right, result))
-    return not rows * columns <= size**2 and not (np.abs(left) @ np.abs(right)).max() <= size
+    return not rows * columns <= size * size and not (np.abs(left) @ np.abs(right)).max() <= size
 
 
 def _norm(a: Array) -> float:
