@@ -226,7 +226,7 @@ class SampledMotion:
         """States (nz, ntime) at times [s] of the run, after the samples of those times."""
         spans, moving = self._spans, self.form.moving
         which = self._spans_at(times)
-        z: Array = np.take(self.states, spans.interval[which], axis=0).T
+        z: Array = np.take(self.states.T, spans.interval[which], axis=1)
         if not moving.size:
             return z
         since = times - spans.starts[which]
@@ -236,13 +236,15 @@ class SampledMotion:
         whole = inside & spans.whole[which]
         if np.count_nonzero(np.bincount(spans.kinds[which[whole]], minlength=1)) > _KINDS:
             whole[:] = False
-        x = np.take(self._starts, which, axis=0)
+        x = np.take(self._starts.T, which, axis=1)
         for some, states in ((whole, self._by_series), (inside & ~whole, self._by_nodes)):
             if some.all():
-                x = states(which, since)
+                x = states(which, since).T
             elif some.any():
-                x[some] = states(which[some], since[some])
-        z[moving] = x.T
+                own = np.flatnonzero(some)
+                for row, found in zip(x, states(which[own], since[own]).T, strict=True):
+                    row[own] = found
+        z[moving] = x
         return z
 
     @property
@@ -624,14 +626,21 @@ def _part_by_part(
 def _evaluated(series: Array, row: NDArray[np.intp], x: Array) -> Array:
     """Values (ntime, nx) of Chebyshev series (nspans, nterms, nx) in some rows at places from -1 to 1."""
     count, nx = series.shape[1:]
-    found = np.empty((x.size, nx))
+    terms = series.transpose(2, 1, 0).copy()  # states side by side: rows in one piece are read faster
+    found = np.empty((nx, x.size))
     for begin in range(0, x.size, _TOGETHER):
         some = slice(begin, begin + _TOGETHER)
-        place = x[some]
-        basis = np.empty((count, place.size))
+        place, own = x[some], row[some]
+        basis, term = np.empty((count, place.size)), np.empty(place.size)
         basis[:1], basis[1:2] = 1.0, place
         for j in range(2, count):
             np.multiply(2.0 * place, basis[j - 1], out=basis[j])
             basis[j] -= basis[j - 2]
-        np.einsum("tjn,jt->tn", series[row[some]], basis, out=found[some])
-    return found
+        for n in range(nx):
+            total = found[n, some]
+            np.take(terms[n, 0], own, out=total, mode="clip")
+            for j in range(1, count):
+                np.take(terms[n, j], own, out=term, mode="clip")
+                term *= basis[j]
+                total += term
+    return found.T
