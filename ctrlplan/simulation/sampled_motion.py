@@ -57,6 +57,9 @@ _KINDS = 64
 _TOGETHER = 2**12
 """Number of times whose matrices are computed together."""
 
+_AT_ONCE = 2**14
+"""Number of times whose states are computed together: memory that is used again is faster than fresh one."""
+
 _PIECE = 24
 """Number of Chebyshev terms of a signal in a part of an interval."""
 
@@ -219,11 +222,21 @@ class SampledMotion:
         self._held = schedule.held
         order = self._values.shape[1] // max(1, fed.size)
         self._kernel = FlowKernel(form.a[:, form.moving], form.a[:, self._held], form.b[:, fed], order)
+        self._tables: dict[tuple[int, int], Array] = {}
         with np.errstate(all="ignore"):
             self.states = self._run(z)
 
     def at(self, times: Array) -> Array:
         """States (nz, ntime) at times [s] of the run, after the samples of those times."""
+        if times.size <= _AT_ONCE:
+            return self._at(times)
+        z = np.empty((self.states.shape[1], times.size))
+        for begin in range(0, times.size, _AT_ONCE):
+            z[:, begin : begin + _AT_ONCE] = self._at(times[begin : begin + _AT_ONCE])
+        return z
+
+    def _at(self, times: Array) -> Array:
+        """The same for some of the times."""
         spans, moving = self._spans, self.form.moving
         which = self._spans_at(times)
         z: Array = np.take(self.states.T, spans.interval[which], axis=1)
@@ -345,11 +358,16 @@ class SampledMotion:
         """Chebyshev series (nspans, nterms, nx) of the flow in one cell of some intervals of equal length."""
         length = float(self._spans.different[kind])
         cells = self.cells(kind)
-        table = self._kernel.within(length, cell / cells, (cell + 1) / cells, self._kernel.terms(length / cells))
+        table = self._tables.get((kind, cell))
+        if table is None:
+            count = self._kernel.terms(length / cells)
+            if len(self._tables) >= _KINDS:
+                self._tables.clear()
+            table = self._tables[kind, cell] = self._kernel.within(length, cell / cells, (cell + 1) / cells, count)
         count, nx = table.shape[:2]
         found: Array = (self._known(which) @ table.reshape(count * nx, -1).T).reshape(-1, count, nx)
         found[:, 0] += self._starts[which]
-        size = np.abs(found).max(axis=0, initial=0.0)
+        size = _largest(found)
         used = np.flatnonzero(np.any(size > _NEGLIGIBLE * size.max(axis=0), axis=1))
         return found[:, : int(used.max(initial=0)) + 1]
 

@@ -75,8 +75,8 @@ def _run_sampled(job: Job, form: SampledForm) -> Record:
         times = np.union1d(times, motion.instants.times)
 
     def snapshot(t: Array, x: Array) -> Snapshot:
-        registers = known[n:] if t is times else motion.registers_at(t)
-        z, w = np.concatenate([x, registers]), signal_values(time_signals, t)
+        z = known if t is times else np.concatenate([x, motion.registers_at(t)])
+        w = signal_values(time_signals, t)
 
         def signals() -> Array:
             return np.asarray(form.signals_z @ z + form.signals_w @ w)
