@@ -37,8 +37,8 @@ _NODES = 16
 _STEPS = 50_000
 """Maximum number of steps."""
 
-_LEVELS = 40
-"""Maximum number of halvings of a step."""
+_LEVELS, _MORE = 40, 7
+"""Maximum number of halvings of a step for its length, and number of attempts with one more for the inputs."""
 
 _RESOLVED, _NOISE = 1e-15, 1e-10
 """Last Legendre coefficients of an input, relative to the largest value, at which it is resolved, or its rounding."""
@@ -89,14 +89,16 @@ def moment_states(
     levels = max(0, ceil(log2(max(norm * sample, 1e-300))))
     if levels > _LEVELS or timepts.size > _STEPS:
         return None
-    step = sample * 0.5**levels
     with np.errstate(all="ignore"):
-        changes = _changes(step * a, levels)
-        responses = _responses(step * a, step * b)
-        cells = _cells(values, marks, first, sample, timepts.size - 1, levels)
-        if changes is None or cells is None:
+        tried = (_cells(values, marks, first, sample, timepts.size - 1, levels + more) for more in range(_MORE))
+        cells = next((found for found in tried if found is not None), None)
+        if cells is None:
             return None
-        forced = _forced(cells, changes, responses)
+        step = sample * 0.5 ** (len(cells.levels) - 1)
+        changes = _changes(step * a, len(cells.levels) - 1)
+        if changes is None:
+            return None
+        forced = _forced(cells, changes, _responses(step * a, step * b))
         found = repeated(state, changes[0], forced, timepts.size - 1)
     states = np.concatenate([initial[:, None], scale[:, None] * found.T], axis=1)
     return states if np.isfinite(states).all() else None

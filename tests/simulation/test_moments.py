@@ -100,3 +100,14 @@ def test_fast_and_slow_states(marks, turned):
     error = np.abs(turn.T @ found - np.array([expected[t] for t in even]).T).max(axis=1)
     # Turning rounds entries by half an ulp of the fastest rate, which moves slow states by that over the run.
     assert np.all(error <= (100.0 * 40 * 2.0**-53 * rates.max() if turned else 1e-14))
+
+
+@pytest.mark.parametrize("rate", [1.0, 1e3])
+def test_an_input_that_needs_shorter_steps(rate):
+    """x' = -p x + sin(w t) with 12 periods between two samples: x = Im((exp(i w t) - exp(-p t))/(p + i w))."""
+    even, w = np.linspace(0.0, 1.0, 6), 2.0 * np.pi * 60.0
+    found = moment_states(
+        np.array([[-rate]]), np.array([[1.0]]), lambda t: np.sin(w * t)[None], np.zeros(0), even, np.zeros(1)
+    )
+    expected = ((np.exp(1j * w * even) - np.exp(-rate * even)) / (rate + 1j * w)).imag
+    assert np.abs(found - expected).max() <= 1e-14
