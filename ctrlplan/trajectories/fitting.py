@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_count, checked_vector, real_array
-from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers
 from ctrlplan.trajectories.least_squares import LeastSquares, Solution, divided
 from ctrlplan.trajectories.piecewise_polynomial import PiecewisePolynomial
 from ctrlplan.trajectories.swing import MAXIMUM_SWING
@@ -143,7 +143,7 @@ def fit(
         with np.errstate(over="ignore"):
             found = np.where(sums > 0.0, (errors**2).sum(axis=1), 0.0)
         _refuse_missed("smoothing", "sum of squared deviations", found, sums, rows, splines)
-    plan = plan._with_fields(deviation=readonly(deviation))
+    plan = PiecewisePolynomial(knots, table, labels=labels, deviation=deviation)
     if warn:
         _warn_of_swing(plan, rows)
     return plan
