@@ -25,6 +25,7 @@ from ctrlplan.simulation.segments import (
     Course,
     SampleTimes,
     as_fraction,
+    check_periods,
     integrate,
     known_before,
     time_tolerance,
@@ -118,6 +119,7 @@ def steps_of(prepared: Prepared, grid: Grid, state: Array, params: Params, rtol:
         )
     if prepared.is_discrete:
         return DiscreteSteps(prepared, network, grid, state, params)
+    check_periods([network.blocks[i] for i in network.blocks_with("period")], grid.time(0), grid.time(1))
     if network.blocks and all(b.linear or b.plan is not None or b.held is not None for b in network.blocks):
         return SampledSteps(prepared, network, grid, state, params)
     return NumericalSteps(prepared, network, grid, state, params, rtol)

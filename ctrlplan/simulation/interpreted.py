@@ -549,7 +549,10 @@ def _passed_on(image: Callable[[Array], Array], start: Array, times: int) -> Arr
 
 
 def _root(residual_of: Callable[[Array], Array], guess: Array, names: str, t: float) -> Array:
-    """Solution of an algebraic loop by Newton's iteration; one step if it is linear."""
+    """Solution of an algebraic loop by Newton's iteration; one step if it is linear.
+
+    Tolerances and steps are relative to the signals of the loop, in any unit.
+    """
     z = guess.copy()
     residual = residual_of(z)
 
@@ -559,9 +562,10 @@ def _root(residual_of: Callable[[Array], Array], guess: Array, names: str, t: fl
         except Exception:  # outside the domain of a block
             return np.full(z.size, np.nan)
 
+    size = _sizes(trial_residual, z, residual)
     for _ in range(50):
-        size = 1.0 + np.abs(z)
-        if np.all(np.abs(residual) <= 1e-13 * size):
+        size = np.where((now := np.maximum(np.abs(z), np.abs(z + residual))) > 0.0, now, size)
+        if np.all(np.abs(residual) <= 1e-13 * now):
             return z
         slope = np.empty((z.size, z.size))
         for j in range(z.size):
@@ -572,22 +576,44 @@ def _root(residual_of: Callable[[Array], Array], guess: Array, names: str, t: fl
                 slope[:, j] = (residual - trial_residual(z - step)) / step[j]
         if not np.isfinite(slope).all():
             break
-        change = np.linalg.lstsq(slope, -residual, rcond=1e-14)[0]
+        change = size * np.linalg.lstsq(slope * size, -residual, rcond=1e-14)[0]
         before = np.abs(residual).max()
+        following = trial_residual(z + change)
+        if not np.abs(following).max() < 0.5 * before and _is_solved(residual, size):
+            return z  # up to rounding errors of the blocks
         for _ in range(30):
-            following = trial_residual(z + change)
             if np.abs(following).max() < before:
                 break
             change = 0.5 * change
+            following = trial_residual(z + change)
         else:
             break
         z, residual = z + change, following
-    if np.all(np.abs(residual) <= 1e-9 * (1.0 + np.abs(z))):
+    if _is_solved(residual, size):
         return z
     raise LoopError(
         f"the algebraic loop of the blocks {names} must have a solution that Newton's iteration finds, "
         f"got a residual of {np.abs(residual).max():.3g} at {t:g} s"
     )
+
+
+def _sizes(residual_of: Callable[[Array], Array], z: Array, residual: Array) -> Array:
+    """Magnitudes of the signals of an algebraic loop, from block to block where they start at 0; 1 if all are 0."""
+    size = np.maximum(np.abs(z), np.abs(z + residual))
+    for _ in range(z.size - 1):
+        if size.all() or not np.isfinite(residual).all():
+            break
+        z = z + residual
+        residual = residual_of(z)
+        size = np.where(size > 0.0, size, np.nan_to_num(np.abs(z + residual)))
+    return np.where(size > 0.0, size, 1.0)
+
+
+def _is_solved(residual: Array, size: Array) -> bool:
+    """Whether the residual of an algebraic loop is one of rounding errors, if Newton's iteration does not reduce it."""
+    largest = float(size.max())
+    rounding = 64.0 * np.finfo(float).eps * largest + 1e-13
+    return bool(np.all(np.abs(residual) <= 1e-9 * np.minimum(largest, 1.0 + size) + rounding))
 
 
 class _StalledError(Exception):

@@ -24,8 +24,11 @@ from ctrlplan.symbolic.libraries import is_impure, is_pure
 from ctrlplan.symbolic.references import References
 from ctrlplan.traits import traits_of
 
-_GO_ON = (io.IOBase, random.Random, np.random.Generator, np.random.RandomState, np.random.BitGenerator)
-"""Objects that are meant to go on from run to run: files and random generators."""
+_GENERATORS = (random.Random, np.random.Generator, np.random.RandomState, np.random.BitGenerator)
+"""Random generators, whose state is memory like any other."""
+
+_GO_ON = (io.IOBase, *_GENERATORS)
+"""Objects whose contents are not compared after a run: files go on from run to run, generators are restored."""
 
 _RUNNING = threading.RLock()
 """Held during runs of blocks with memory, since loops may share objects."""
@@ -73,6 +76,8 @@ class _Memory:
         self._system = block.system
         found = References((f"block {block.name}", function) for function in _functions(block.system))
         self._keeper, self._complete = Keeper(found), found.complete
+        drawn = {id(value): value for value in (*found.hidden, *found.objects) if isinstance(value, _GENERATORS)}
+        self._generators = [rewind for value in drawn.values() if (rewind := _rewinding(value)) is not None]
         doubtful = [*found.hidden, *filter(_of_library, found.objects)]
         self._doubtful = [(value, _pickled(value)) for value in doubtful if not _goes_on(value)]
         if _CHANGED.get(block.system) is False:
@@ -87,6 +92,8 @@ class _Memory:
     def restore(self) -> None:
         """Restore what the block remembers, and note whether that is not possible."""
         self._keeper.restore()
+        for rewind in self._generators:
+            rewind()
         if not self._complete or any(_differs(value, before) for value, before in self._doubtful):
             _CHANGED.setdefault(self._system, False)
 
@@ -112,8 +119,25 @@ def _functions(system: System) -> Iterator[Callable[..., Value]]:
 
 
 def _goes_on(value: object) -> bool:
-    """Whether an object has no memory of a run, or is meant to go on: a cache, a file, a random generator."""
+    """Whether an object has no memory of a run, goes on, or is restored: a cache, a file, a random generator."""
     return isinstance(value, _GO_ON) or hasattr(value, "cache_info") or is_impure(type(value))
+
+
+def _rewinding(value: object) -> Callable[[], None] | None:
+    """Function that restores the present state of a random generator; None for those of the whole process.
+
+    The functions of the modules `random` and `numpy.random` share the latter with all
+    other code. A generator of the operating system has no state.
+    """
+    shared = [getattr(function, "__self__", None) for function in (random.random, np.random.normal)]
+    if any(value is one for one in shared) or isinstance(value, random.SystemRandom):
+        return None
+    if isinstance(value, random.Random):
+        return partial(value.setstate, value.getstate())
+    if isinstance(value, np.random.RandomState):
+        return partial(value.set_state, value.get_state(legacy=False))
+    bits = value.bit_generator if isinstance(value, np.random.Generator) else value
+    return partial(setattr, bits, "state", bits.state) if isinstance(bits, np.random.BitGenerator) else None
 
 
 def _of_library(value: object) -> bool:

@@ -295,10 +295,17 @@ class Network:
 
         They depend on what these blocks hold only, through blocks without states and delays if there are any.
         """
+        if not any(block.holds for block in self.blocks):
+            return np.zeros(self.nsignals, dtype=np.bool_)
+        return self._steady
+
+    @cached_property
+    def _steady(self) -> NDArray[np.bool_]:
+        """The same, and constants of blocks without inputs in a loop without discrete blocks."""
         held = np.zeros(self.nsignals, dtype=np.bool_)
         for block, place in zip(self.blocks, self.outputs, strict=True):
             held[place] = block.holds
-        changed = bool(held.any())
+        changed = True
         while changed:
             changed = False
             for block, rows, place in zip(self.blocks, self.inputs, self.outputs, strict=True):
@@ -312,8 +319,8 @@ class Network:
         return np.flatnonzero(~self.read[:, ~self.held].any(axis=1) & self.read.any(axis=1))
 
     def is_held(self, i: int) -> bool:
-        """Whether all inputs of a block are held signals."""
-        return not self.wire[self.inputs[i]][:, ~self.held].any()
+        """Whether all inputs of a block are held signals or constants."""
+        return not self.wire[self.inputs[i]][:, ~self._steady].any()
 
     @cached_property
     def to_outputs(self) -> Callable[[Array], Array]:

@@ -29,6 +29,7 @@ from ctrlplan.simulation.scales import (
     remaining,
     rounding_of,
 )
+from ctrlplan.simulation.segment_lengths import warn_of_short_delays
 from ctrlplan.simulation.segments import NetworkRun, Solver, integrate, known_before
 from ctrlplan.simulation.signals import TimeSignals, breakpoints_of
 from ctrlplan.symbolic.isolation import untouched
@@ -121,6 +122,9 @@ class History(Protocol[S]):
 
 def numerical(job: Job, method: NumericalMethod[S], history: History[S] | None = None) -> Record:
     """Record of a numerical run, repeated with the scales of the states and if its accuracy requires it."""
+    if job.blocks.blocks_with("delay"):
+        signals = job.prepared.time_signals(job.inputs, job.first)
+        warn_of_short_delays(job.blocks, signals, float(job.times[-1]) - job.first)
     fresh = fresh_job(job)
     attempt = _first(job, method, history)
     scales = attempt.scales

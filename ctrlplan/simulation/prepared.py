@@ -25,6 +25,7 @@ from ctrlplan.simulation.built_forms import (
 )
 from ctrlplan.simulation.delayed_signals import DelayedSignal, HeldDelaySignal
 from ctrlplan.simulation.interpreted import Interpreted
+from ctrlplan.simulation.known_delays import with_known_delays
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Block, Network, UnsupportedError, structure
 from ctrlplan.simulation.sampled_form import DelayedForm, SampledForm, delayed_form, sampled_form
@@ -170,7 +171,8 @@ class Prepared(Displayed):
                 kind = HeldDelaySignal if self.network.is_held(i) else DelayedSignal
                 initial = np.broadcast_to(np.asarray(block.traits.initial, dtype=float), (block.system.ninputs,))
                 found.append(kind(block.delay, initial, first))
-        return [*found, *sources]
+        found += sources
+        return found if self.network is None else with_known_delays(self.network, found, first)
 
     def compiled(
         self, params: Params, time_signals: Sequence[TimeSignal], first: float, state: Array, trials: bool = True

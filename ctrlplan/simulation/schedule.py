@@ -12,9 +12,7 @@ from ctrlplan.simulation.delay_lines import DelayLine, Steps
 from ctrlplan.simulation.flow_kernel import FlowKernel
 from ctrlplan.simulation.instants import Instants, instants_of
 from ctrlplan.simulation.sampled_form import Line, SampledForm
-
-_INSTANTS = 5e6
-"""Maximum number of sample times of a run, whose states are stored."""
+from ctrlplan.simulation.segments import SAMPLES
 
 _KEPT, _ENTRIES = 2**16, 2**19
 """Maximum numbers of instants and of entries of matrices that are kept for further runs."""
@@ -114,8 +112,8 @@ def schedule_of(form: SampledForm, first: float, last: float, tolerance: float) 
         If there are too many sample times.
     """
     count = sum((last - first) / float(period) for period, _ in form.timings)
-    if count > _INSTANTS:
-        raise NotApplicableError(f"{form.name} has {count:.3g} sample times, more than {_INSTANTS:.0e}")
+    if count > SAMPLES:
+        raise NotApplicableError(f"{form.name} has {count:.3g} sample times, more than {SAMPLES:.0e}")
 
     def new() -> Schedule:
         return Schedule(form, instants_of(form.timings, first, last, tolerance))

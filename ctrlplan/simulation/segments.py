@@ -18,13 +18,16 @@ from ctrlplan._types import Array
 from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.delayed_signals import DelayedSignal, HeldDelaySignal
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
+from ctrlplan.simulation.known_delays import is_found_in_run
 from ctrlplan.simulation.network import Block, Network
 from ctrlplan.simulation.scales import in_turn
+from ctrlplan.simulation.segment_lengths import longest_segment
 from ctrlplan.simulation.signals import (
     RESOLVED,
     Series,
     TimeSignal,
     TimeSignals,
+    after_marks,
     breakpoints_of,
     chebyshev_coefficients,
     chebyshev_times,
@@ -39,9 +42,6 @@ _SHORTEST = 1.0 / 64.0
 _HOPS = 6
 """Number of delays after which a jump has become smooth enough to be ignored."""
 
-
-_SHORTEST_DELAY = 1e-5
-"""Minimum delay, relative to the run."""
 
 _TOLERANCE = 1e-12
 """Difference of two times, relative to the run, up to which they are considered equal."""
@@ -58,11 +58,11 @@ _JUMP = 1e-9
 _ROUNDINGS = 64.0
 """Rounding errors of a plan, in units of the last place of its largest values."""
 
-_SEGMENTS = 2_000
-"""Maximum number of segments that the declared `longest` step of blocks may cause."""
-
 _FIRST, _LATER = 8.0, 4.0
 """Length of the first segment, and maximum length of others, as fractions of a run that an event may end."""
+
+SAMPLES = 5_000_000
+"""Maximum number of sample times of a run: states at all of them are stored, and nonlinear loops take half an hour."""
 
 _MARKS = 20_000
 """Maximum number of times of jumps at which a run stops."""
@@ -301,7 +301,7 @@ def _lengths(network: Network, delays: list[float], duration: float, stops: bool
 
     A run that may stop has shorter segments: there may be no solution after the event.
     """
-    longest = _longest(network, delays, duration)
+    longest = longest_segment(network, delays, duration)
     if not stops:
         return np.inf, longest, longest
     return 1e-9 * duration, min(longest, duration / _FIRST), min(longest, duration / _LATER)
@@ -324,17 +324,6 @@ def _advanced(solver: Solver, series: Series, left: float, grid: Array, state: A
     return found
 
 
-def _longest(network: Network, delays: list[float], duration: float) -> float:
-    """Maximum length of a segment [s], from the delays and the declarations of the blocks."""
-    longest = min([duration, *delays])
-    if longest < _SHORTEST_DELAY * duration:
-        raise ValueError(
-            f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {duration:g} s, got {longest:g} s"
-        )
-    declared = min((block.traits.longest for block in network.blocks), default=np.inf)
-    return min(longest, max(declared, duration / _SEGMENTS))
-
-
 class _Memory:
     """Stored inputs of the delays: segment by segment, and change by change of those that sampled blocks hold.
 
@@ -351,9 +340,10 @@ class _Memory:
     def __init__(self, network: Network, solver: Solver, time_signals: TimeSignals, resolution: float) -> None:
         late = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
         pairs = list(zip(late, network.blocks_with("delay"), strict=True))
-        self._every, self._all_time_signals = late, time_signals
+        self._every = [signal for signal in late if is_found_in_run(signal)]
+        self._all_time_signals = time_signals
         self._held = [(signal, network.fed[i]) for signal, i in pairs if isinstance(signal, HeldDelaySignal)]
-        self._time_signals = [signal for signal in late if not isinstance(signal, HeldDelaySignal)]
+        self._time_signals = [signal for signal in self._every if not isinstance(signal, HeldDelaySignal)]
         blocks = [i for signal, i in pairs if signal in self._time_signals]
         self._fed = [network.fed[i] for i in blocks]
         self._wires, self._time_rows = [network.wire[network.inputs[i]] for i in blocks], network.time_rows
@@ -520,7 +510,7 @@ class _Schedule:
         times, values = self._ahead
         k = int(times.searchsorted(t - self._tolerance))
         if k == times.size or times[k] > t + self._tolerance:
-            count = 0 if any(isinstance(signal, DelayedSignal) for signal in self._time_signals) else _AHEAD
+            count = 0 if any(map(is_found_in_run, self._time_signals)) else _AHEAD
             times = np.array([t, *self.samples.following(count, self._fixed[-1])])
             values, k = values_after(self._time_signals, times, self._tolerance), 0
             self._ahead = times, values
@@ -593,26 +583,26 @@ def values_after(time_signals: Sequence[TimeSignal], times: Array, tolerance: fl
     """Signals (nsignals, ntime) at times, after a breakpoint that differs from one by rounding."""
     end = float(np.nextafter(times[-1] + tolerance, np.inf)) if times.size else 0.0
     marks = [signal.breakpoints_between(times[0], end) if times.size else times for signal in time_signals]
-    seen = [signal.at(_after(near, times, tolerance)) for signal, near in zip(time_signals, marks, strict=True)]
+    seen = [signal.at(after_marks(near, times, tolerance)) for signal, near in zip(time_signals, marks, strict=True)]
     return np.asarray(np.concatenate([np.zeros((0, times.size)), *seen]))
 
 
-def _after(marks: Array, times: Array, tolerance: float) -> Array:
-    """Times, replaced by a breakpoint that follows within a tolerance."""
-    if not len(marks):
-        return times
-    following = np.asarray(marks)[np.minimum(np.searchsorted(marks, times), len(marks) - 1)]
-    return np.where((following >= times) & (following - times <= tolerance), following, times)
-
-
 def check_periods(blocks: Sequence[Block], first: float, last: float) -> None:
-    """Raise for sampled blocks with sample times that are not distinct in a run."""
+    """Raise for sampled blocks with sample times that are not distinct in a run, or far too many."""
     for block in blocks:
         if float(block.period or 0.0) < 4.0 * time_tolerance(first, last):
             raise ValueError(
                 f"the period of {block.name} must exceed the rounding of times up to "
                 f"{max(abs(first), abs(last)):g} s, got {block.period:g} s"
             )
+    counts = [(last - first) / float(block.period or np.inf) for block in blocks]
+    if sum(counts) > SAMPLES:
+        most = blocks[int(np.argmax(counts))]
+        raise ValueError(
+            f"a run must have at most {SAMPLES:.0e} sample times, got {sum(counts):.3g} in {last - first:g} s, with "
+            f"the period of {most.name} of {most.period:g} s; use a longer period or a shorter run, or a continuous "
+            "block in its place"
+        )
 
 
 def time_tolerance(first: float, last: float) -> float:
@@ -629,12 +619,11 @@ def as_fraction(seconds: float) -> Fraction:
 
 
 def known_before(time_signals: TimeSignals, times: Array) -> Array:
-    """Signals (nsignals, ntime) that are known before a run; 0 for the outputs of delays."""
-    if not any(isinstance(signal, DelayedSignal) for signal in time_signals):
+    """Signals (nsignals, ntime) that are known before a run; 0 for what becomes known during it."""
+    if not any(map(is_found_in_run, time_signals)):
         return time_signals.at(times)
     rows = [
-        np.zeros((signal.width, times.size)) if isinstance(signal, DelayedSignal) else signal.at(times)
-        for signal in time_signals
+        np.zeros((signal.width, times.size)) if is_found_in_run(signal) else signal.at(times) for signal in time_signals
     ]
     return np.concatenate([np.zeros((0, times.size)), *rows])
 

@@ -532,6 +532,14 @@ def _time_signal(value: Trajectory | ArrayLike, name: str, times: Array) -> Time
     return SampledSignal(times, signal)
 
 
+def after_marks(marks: Array, times: Array, tolerance: float) -> Array:
+    """Times, replaced by a breakpoint that follows within a tolerance."""
+    if not len(marks):
+        return times
+    following = np.asarray(marks)[np.minimum(np.searchsorted(marks, times), len(marks) - 1)]
+    return np.where((following >= times) & (following - times <= tolerance), following, times)
+
+
 def within(left: float, right: float, switches: Sequence[float]) -> tuple[float, float]:
     """First and last time of a segment at which its equations are evaluated.
 

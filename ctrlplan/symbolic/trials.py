@@ -191,7 +191,7 @@ def _has_memory(value: object, seen: set[int], depth: int) -> bool:
         parts = tuple(value.syslist)
     elif isinstance(value, ct.NonlinearIOSystem):
         return not isinstance(value, ct.StateSpace) and can_remember(value)
-    elif isinstance(value, np.random.Generator | np.random.RandomState):
+    elif isinstance(value, np.random.Generator | np.random.RandomState | np.random.BitGenerator):
         return True
     elif isinstance(value, FunctionType):
         if of_library(value):

@@ -416,3 +416,29 @@ def test_a_wire_that_feeds_itself(method):
     )
     with pytest.raises((ValueError, RuntimeError), match=r"must not form a loop without a block.*joined|loop"):
         cp.simulate(loop, T, method=method)
+
+
+@pytest.mark.parametrize("kind", ["saturating", "quadratic"])
+@pytest.mark.parametrize("scale", [1e-14, 1e-10, 1e-4, 1.0, 1e6, 1e10, 1e14])
+def test_signals_of_any_size(scale, kind):
+    """Pressures of 1e10 Pa and charges of 1e-14 C: the same loop in other units has the same solution."""
+
+    def forward(e):
+        return np.tanh(e) if kind == "saturating" else e
+
+    def back(y):
+        return 0.5 * y + 0.1 * np.sin(y) if kind == "saturating" else 0.7 * y + 0.2 * y * abs(y)
+
+    blocks = [
+        ct.nlsys(
+            None, lambda t, x, u, p: [scale * forward((u[0] - u[1]) / scale)], inputs=["r", "z"], outputs="y", name="a"
+        ),
+        ct.nlsys(None, lambda t, x, u, p: [scale * back(u[0] / scale)], inputs="y", outputs="z", name="b"),
+    ]
+    loop = ct.interconnect(blocks, inputs="r", outputs=["y", "z"])
+    times = np.linspace(0.0, 1.0, 5)
+    found = cp.simulate(loop, times, scale * np.sin(times))
+    y = [brentq(lambda y, r=r: y - forward(r - back(y)), -2.0, 2.0, xtol=1e-15) for r in np.sin(times)]
+    # The slope of the residual is at least 1: the error is at most its rounding errors.
+    assert np.abs(found.outputs[0] / scale - y).max() <= 1e-12
+    assert np.abs(found.outputs[1] / scale - back(np.array(y))).max() <= 2e-12

@@ -5,6 +5,7 @@ import collections
 import concurrent.futures
 import gc
 import itertools
+import random
 import warnings
 
 import control as ct
@@ -241,3 +242,38 @@ def test_a_stepper_goes_on_with_the_memory():
     times = PERIOD * np.arange(51)
     np.testing.assert_allclose(given, cp.simulate(loop(new), times, 1.0).outputs[0, 1:], rtol=1e-6)
     assert law.total > 0.0
+
+
+GENERATORS = {
+    "Generator": (np.random.default_rng, lambda rng: rng.normal()),
+    "RandomState": (np.random.RandomState, lambda rng: rng.normal()),
+    "Random": (random.Random, lambda rng: rng.gauss(0.0, 1.0)),
+    "bits": (np.random.PCG64, lambda bits: bits.random_raw() / 2.0**64),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", GENERATORS)
+def test_each_plan_of_a_comparison_meets_the_same_random_numbers(name, kind):
+    """The measurement noise of the law is the same for all plans, from the present state of its generator."""
+    made, draw = GENERATORS[name]
+    rng, apart = made(5), made(5)
+    before = [draw(rng), draw(apart)]
+    assert before[0] == before[1]
+    given = loop(lambda error: 2.0 * (error + 0.01 * draw(rng)), kind)
+    t = PERIOD * np.arange(51)
+    compared = cp.compare(given, {"a": PLAN, "b": PLAN, "late": PLAN.shift(0.1)}, t)
+    assert np.array_equal(compared.responses["a"].outputs, compared.responses["b"].outputs)
+    noise = np.array([draw(apart) for _ in t])
+    for key, plan in (("a", PLAN), ("late", PLAN.shift(0.1))):
+        y, u = compared.responses[key].outputs
+        assert np.abs(u - 2.0 * (plan(t) - y + 0.01 * noise)).max() <= 1e-12
+    assert draw(rng) == draw(made_at(made, draw, 1)), "the generator is left as it was"
+
+
+def made_at(made, draw, count):
+    """A generator of the same seed after some numbers."""
+    rng = made(5)
+    for _ in range(count):
+        draw(rng)
+    return rng

@@ -15,6 +15,9 @@ from ctrlplan.simulation.signals import breakpoints_of, signal_values
 _MAX_STEPS = 1e8
 """Maximum number of steps of a discrete system in a run."""
 
+_MAX_VALUES = 5e8
+"""Maximum number of states and signals at all steps, which are stored: 4 GB."""
+
 _OFF_INSTANT = 1e-5
 """Fraction of the sampling time by which a time may differ from a sample time, in addition to rounding."""
 
@@ -38,7 +41,7 @@ class Discrete:
     def run(self, job: Job) -> Record:
         """States at every sample of a job."""
         prepared, network = job.prepared, job.blocks
-        instants = _sampling_instants(job.times, prepared.dt)
+        instants = _sampling_instants(job.times, prepared.dt, job.state.size + network.nsignals)
         time_signals = prepared.time_signals(job.inputs, job.first)
         equations = Interpreted(network, job.params, (job.first, job.state), job.trials)
         near = 8.0 * np.finfo(float).eps * float(np.abs(instants).max())
@@ -63,8 +66,11 @@ class Discrete:
         return Record(instants, states, snapshot, lambda k, t: states[:, k], job.watched(), self.name, job.reason)
 
 
-def _sampling_instants(times: Array, dt: float | bool) -> Array:
-    """Sample times of a discrete system from the first time to the last, which include the given times."""
+def _sampling_instants(times: Array, dt: float | bool, width: int) -> Array:
+    """Sample times of a discrete system from the first time to the last, which include the given times.
+
+    `width` is the number of values that are stored at each of them.
+    """
     rounding = 4.0 * np.finfo(float).eps * np.abs(times).max()
     if isinstance(dt, bool):
         spacing = np.diff(times)
@@ -80,8 +86,12 @@ def _sampling_instants(times: Array, dt: float | bool) -> Array:
             f"timepts must resolve sample times {period:g} s apart, got times up to {np.abs(times).max():g} s"
         )
     steps = (times - times[0]) / period
-    if steps[-1] > _MAX_STEPS:
-        raise ValueError(f"timepts must span at most {_MAX_STEPS:g} periods of a discrete system, got {steps[-1]:.3g}")
+    most = min(_MAX_STEPS, _MAX_VALUES / width)
+    if steps[-1] > most:
+        raise ValueError(
+            f"timepts must span at most {most:.3g} periods of a discrete system, got {steps[-1]:.3g}, since {width} "
+            "states and signals are stored at each; use a shorter run"
+        )
     requested = np.round(steps)
     off = np.abs(steps - requested)
     if off.max() > _OFF_INSTANT + rounding / period:
