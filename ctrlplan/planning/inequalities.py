@@ -102,5 +102,5 @@ def _least_squares(matrix: Array, right: Array) -> Array:
     """Unknowns of at least 0 with the smallest squares of ``matrix @ u - right``."""
     try:
         return np.asarray(nnls(matrix, right, maxiter=50 * matrix.shape[1])[0])
-    except RuntimeError:  # releases of scipy that solve normal equations may not end
+    except (RuntimeError, np.linalg.LinAlgError):  # releases of scipy that solve normal equations may not end, or fail
         return np.asarray(lsq_linear(matrix, right, (0.0, np.inf), method="bvls", tol=1e-14).x)

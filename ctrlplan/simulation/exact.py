@@ -20,9 +20,10 @@ overflow are infinite, and so is what depends on them; others stay finite.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from functools import lru_cache, reduce
+from itertools import repeat
 from math import factorial
 
 import numpy as np
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.linalg import matrix_balance, pascal
 
 from ctrlplan._types import Array
+from ctrlplan.simulation.exponential import MANY_STATES, changes_of_many
 from ctrlplan.simulation.pairs import pair_product, pair_sum
 
 _TERMS = 18
@@ -101,7 +103,9 @@ def exact_states(
     return out
 
 
-def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: Array) -> Array:
+def sampled_states(
+    a: Array, b: Array, samples: Array, timepts: Array, initial: Array, scale: Array | None = None
+) -> Array:
     """States of x' = a x + b u, where u is linear between samples.
 
     Parameters
@@ -114,12 +118,14 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
         Sample times [s], increasing.
     initial : ndarray, shape (nstates,)
         State at the first of them.
+    scale : ndarray, shape (nstates,), optional
+        Balancing scale of the system matrix, if it is known.
 
     Returns
     -------
     ndarray, shape (nstates, ntime)
     """
-    scale, a, b, state = _balanced(a[None], b[None], initial[None])
+    scale, a, b, state = _balanced(a[None], b[None], initial[None], scale)
     out = np.empty((timepts.size, scale.size))
     out[:1] = state
     steps: Array = np.diff(timepts)
@@ -131,7 +137,11 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     part = max(1, _NUMBERS // max(1, n * (n + 1 if even else n + terms.shape[1])))
     with np.errstate(all="ignore"):
         if even and n > _CROSSOVER:
-            out[:] = _marched(state, changes_over(even * a, even * b, 2), terms.T.reshape(2, len(samples), -1))[0].T
+            changes = changes_over(even * a, even * b, 2)
+            change = changes[-1][0, :, :n].copy()  # products with aligned rows are faster
+            out[1:] = _one_by_one(repeat(change, len(terms)), terms @ changes[-1][0, :, n:].T, state[0])
+            if not np.isfinite(out[-1]).all():  # an overflow stays
+                out[:] = _marched(state, changes, terms.T.reshape(2, len(samples), -1))[0].T
             return (out * scale).T
         for begin in range(0, steps.size if n else 0, part):
             these = slice(begin, begin + part)
@@ -197,12 +207,15 @@ def largest_change(a: Array, duration: float) -> float:
     return max(float(np.abs(change).max(initial=0.0)) for change in changes)
 
 
-def _balanced(a: Array, b: Array, initial: Array) -> tuple[Array, Array, Array, Array]:
+def _balanced(a: Array, b: Array, initial: Array, scale: Array | None = None) -> tuple[Array, Array, Array, Array]:
     """Balancing scale (nstates,), and systems and initial states in it.
 
     Powers of two, which cause no rounding; balancing allows longer cells.
     """
-    scale = state_scale(np.abs(a).max(axis=0)) if a.size else np.ones(0)
+    if scale is None:
+        scale = state_scale(a[0] if len(a) == 1 else np.abs(a).max(axis=0)) if a.size else np.ones(0)
+    if (scale == 1.0).all():
+        return scale, a, b, initial
     return scale, a * (scale / scale[:, None]), b / scale[:, None], initial / scale
 
 
@@ -378,6 +391,10 @@ def changes_over(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Arr
     """
     if a.ndim == 2:
         return [change[0] for change in changes_over(a[None], b[None], nterms, halvings)]
+    if len(a) == 1 and a.shape[1] >= MANY_STATES and nterms <= 2 and not halvings:
+        quick = changes_of_many(a[0], b[0], nterms)
+        if quick is not None:
+            return [change[None] for change in quick]
     products, minimum = _products(a, b)
     levels = max(halvings, int(minimum.max()))
     found = _doubled(products, minimum, nterms, levels)
@@ -526,7 +543,7 @@ def _marched(state: Array, changes: list[Array], series: Array) -> Array:
     change = changes[-1][..., :n].copy()  # products with aligned rows are faster
     forced = np.moveaxis(changes[-1][..., n:] @ series.reshape(-1, ncells), 2, 0).copy()
     if count == 1:
-        rows[1:, 0] = _one_by_one(np.broadcast_to(change, (ncells, n, n)), forced[:, 0], state[0])
+        rows[1:, 0] = _one_by_one(repeat(change[0], ncells), forced[:, 0], state[0])
     else:
         for k in range(ncells):
             state = state + ((change @ state[:, :, None])[:, :, 0] + forced[k])
@@ -609,7 +626,7 @@ def _recurrence(change: Array, forced: Array, state: Array) -> Array:
     return (starts + (steps[..., :n] @ starts + steps[..., n:])).reshape(-1, n)[:nsteps]
 
 
-def _one_by_one(change: Array, forced: Array, state: Array) -> Array:
+def _one_by_one(change: Iterable[Array], forced: Array, state: Array) -> Array:
     """The same, one step after the other."""
     found = np.empty(forced.shape)
     for own, given, after in zip(change, forced, found, strict=True):

@@ -69,7 +69,7 @@ class LinearForm:
         growing, fast = duration * poles.real.max() > _GROWING, duration * np.abs(poles).max() > _FAST
         if growing or fast:
             return bool(growing), bool(fast), False
-        rounding = duration * _rounding(self._balanced)
+        rounding = duration * self._rounding
         bound = np.exp(np.clip(duration * self._growth, 0.0, 700.0))
         nonnormal = rounding * bound > _UNCERTAIN and (
             rounding * largest_change(duration * self._balanced, 1.0) ** 2 > _UNCERTAIN
@@ -93,20 +93,25 @@ class LinearForm:
 
     def rounding(self, states: Array, inputs: Array) -> Array:
         """Rounding errors of the outputs for states and inputs of given size, shape (noutputs,)."""
-        scale = self._scale
+        scale = self.scale
         largest = np.abs(states / scale[:, None]).max(initial=0.0)
         fed = np.abs(self.c) @ scale * largest + np.abs(self.d) @ np.abs(inputs).max(axis=1, initial=0.0)
         return np.asarray(64.0 * np.finfo(float).eps * fed)
 
     @cached_property
-    def _scale(self) -> Array:
+    def scale(self) -> Array:
         """Balancing scale (nstates,) of one loop."""
         return state_scale(self.a)
 
     @cached_property
     def _balanced(self) -> Array:
         """Matrix A of one loop in balanced states."""
-        return np.asarray(self.a * (self._scale / self._scale[:, None]))
+        return np.asarray(self.a * (self.scale / self.scale[:, None]))
+
+    @cached_property
+    def _rounding(self) -> float:
+        """Relative rounding errors of A in balanced states."""
+        return float(_rounding(self._balanced))
 
     @cached_property
     def _growth(self) -> float:

@@ -12,7 +12,7 @@ from ctrlplan._types import Array
 PATTERN = 8
 """Minimum number of repetitions of a pattern of steps that are computed together."""
 
-_LARGE = 100
+_LARGE = 64
 """Number of states above which single steps are as fast as blocks of equal ones."""
 
 _TRIED = 64
@@ -34,9 +34,11 @@ def repeated(state: Array, change: Array, forced: Array | None, count: int) -> A
     n = len(change)
     if n > _LARGE and forced is not None:
         found = np.empty((count, *state.shape))
-        for k in range(count):
-            state = state + (change @ state + forced[k])
-            found[k] = state
+        for given, after in zip(forced, found, strict=True):
+            change.dot(state, out=after)
+            after += given
+            after += state
+            state = after
         return found
     per = min(math.isqrt(count - 1) + 1, max(2, count // max(1, n)))  # powers must not cost more than the steps
     nblocks = -(-count // per)

@@ -57,6 +57,9 @@ _KINDS = 64
 _TOGETHER = 2**12
 """Number of times whose matrices are computed together."""
 
+_AT_ONCE = 2**14
+"""Number of times whose states are computed together: memory that is used again is faster than fresh one."""
+
 _PIECE = 24
 """Number of Chebyshev terms of a signal in a part of an interval."""
 
@@ -219,14 +222,24 @@ class SampledMotion:
         self._held = schedule.held
         order = self._values.shape[1] // max(1, fed.size)
         self._kernel = FlowKernel(form.a[:, form.moving], form.a[:, self._held], form.b[:, fed], order)
+        self._tables: dict[tuple[int, int], Array] = {}
         with np.errstate(all="ignore"):
             self.states = self._run(z)
 
     def at(self, times: Array) -> Array:
         """States (nz, ntime) at times [s] of the run, after the samples of those times."""
+        if times.size <= _AT_ONCE:
+            return self._at(times)
+        z = np.empty((self.states.shape[1], times.size))
+        for begin in range(0, times.size, _AT_ONCE):
+            z[:, begin : begin + _AT_ONCE] = self._at(times[begin : begin + _AT_ONCE])
+        return z
+
+    def _at(self, times: Array) -> Array:
+        """The same for some of the times."""
         spans, moving = self._spans, self.form.moving
         which = self._spans_at(times)
-        z: Array = np.take(self.states, spans.interval[which], axis=0).T
+        z: Array = np.take(self.states.T, spans.interval[which], axis=1)
         if not moving.size:
             return z
         since = times - spans.starts[which]
@@ -236,13 +249,15 @@ class SampledMotion:
         whole = inside & spans.whole[which]
         if np.count_nonzero(np.bincount(spans.kinds[which[whole]], minlength=1)) > _KINDS:
             whole[:] = False
-        x = np.take(self._starts, which, axis=0)
+        x = np.take(self._starts.T, which, axis=1)
         for some, states in ((whole, self._by_series), (inside & ~whole, self._by_nodes)):
             if some.all():
-                x = states(which, since)
+                x = states(which, since).T
             elif some.any():
-                x[some] = states(which[some], since[some])
-        z[moving] = x.T
+                own = np.flatnonzero(some)
+                for row, found in zip(x, states(which[own], since[own]).T, strict=True):
+                    row[own] = found
+        z[moving] = x
         return z
 
     @property
@@ -343,11 +358,16 @@ class SampledMotion:
         """Chebyshev series (nspans, nterms, nx) of the flow in one cell of some intervals of equal length."""
         length = float(self._spans.different[kind])
         cells = self.cells(kind)
-        table = self._kernel.within(length, cell / cells, (cell + 1) / cells, self._kernel.terms(length / cells))
+        table = self._tables.get((kind, cell))
+        if table is None:
+            count = self._kernel.terms(length / cells)
+            if len(self._tables) >= _KINDS:
+                self._tables.clear()
+            table = self._tables[kind, cell] = self._kernel.within(length, cell / cells, (cell + 1) / cells, count)
         count, nx = table.shape[:2]
         found: Array = (self._known(which) @ table.reshape(count * nx, -1).T).reshape(-1, count, nx)
         found[:, 0] += self._starts[which]
-        size = np.abs(found).max(axis=0, initial=0.0)
+        size = _largest(found)
         used = np.flatnonzero(np.any(size > _NEGLIGIBLE * size.max(axis=0), axis=1))
         return found[:, : int(used.max(initial=0)) + 1]
 
@@ -624,14 +644,21 @@ def _part_by_part(
 def _evaluated(series: Array, row: NDArray[np.intp], x: Array) -> Array:
     """Values (ntime, nx) of Chebyshev series (nspans, nterms, nx) in some rows at places from -1 to 1."""
     count, nx = series.shape[1:]
-    found = np.empty((x.size, nx))
+    terms = series.transpose(2, 1, 0).copy()  # states side by side: rows in one piece are read faster
+    found = np.empty((nx, x.size))
     for begin in range(0, x.size, _TOGETHER):
         some = slice(begin, begin + _TOGETHER)
-        place = x[some]
-        basis = np.empty((count, place.size))
+        place, own = x[some], row[some]
+        basis, term = np.empty((count, place.size)), np.empty(place.size)
         basis[:1], basis[1:2] = 1.0, place
         for j in range(2, count):
             np.multiply(2.0 * place, basis[j - 1], out=basis[j])
             basis[j] -= basis[j - 2]
-        np.einsum("tjn,jt->tn", series[row[some]], basis, out=found[some])
-    return found
+        for n in range(nx):
+            total = found[n, some]
+            np.take(terms[n, 0], own, out=total, mode="clip")
+            for j in range(1, count):
+                np.take(terms[n, j], own, out=term, mode="clip")
+                term *= basis[j]
+                total += term
+    return found.T

@@ -185,7 +185,10 @@ class Dispatch(Generic[T, R]):
     def _sent(self, chunk: _Chunk) -> Future[Reply[R]]:
         values = [self.values[number] for number in chunk.numbers]
         task = Task(self.runs, self._key, values, self.timeout, chunk.carries)
-        return self.executor.submit(run_task, task)
+        future = self.executor.submit(run_task, task)
+        if not callable(getattr(future, "result", None)):
+            raise RuntimeError(f"submit of the executor must return a future with result, got {future!r:.80}")
+        return future
 
     def _read(self, number: int, reply: Reply[R] | Failed | object) -> None:
         """Take the outcomes of a task, and send again what it has not run."""
@@ -295,4 +298,4 @@ def _end(pool: Executor) -> None:
     """End a process pool that was made here."""
     shutdown = getattr(pool, "shutdown", None)
     if shutdown is not None:
-        shutdown(wait=False, cancel_futures=True)
+        shutdown(wait=False)

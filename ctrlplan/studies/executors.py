@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import pickle
 from asyncio import CancelledError
 from collections.abc import Callable, Mapping
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Generic, Protocol, TypeVar
@@ -77,13 +78,17 @@ def worker_count(executor: Executor) -> int | None:
     return None
 
 
-def new_pool(broken: Executor) -> ProcessPoolExecutor | None:
-    """Process pool of the same size and start method; None if the executor is no process pool."""
-    if not isinstance(broken, ProcessPoolExecutor):
+def new_pool(broken: Executor) -> Executor | None:
+    """Process pool of the same kind, size and start method; None if the executor is no process pool.
+
+    Of `concurrent.futures` or loky, which keep the arguments of a pool under their names.
+    """
+    kind = next((kind for kind in type(broken).__mro__ if kind.__name__ == "ProcessPoolExecutor"), None)
+    if kind is None:
         return None
-    names = ("max_workers", "mp_context", "initializer", "initargs", "max_tasks_per_child")
-    given = {name: getattr(broken, f"_{name}") for name in names if hasattr(broken, f"_{name}")}
-    return ProcessPoolExecutor(**given)
+    names = [name for name in inspect.signature(kind).parameters if hasattr(broken, f"_{name}")]
+    found: Executor = kind(**{name: getattr(broken, f"_{name}") for name in names})
+    return found
 
 
 def is_broken(error: Exception) -> bool:

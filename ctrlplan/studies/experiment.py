@@ -56,12 +56,15 @@ class Measured:
     signals : dict of str to dict of str to ndarray
         Outputs and controls by plan and label, at the samples that were given to
         `Experiment.run_alike`.
+    labels : dict of str to tuple of str
+        Labels of all outputs and controls by plan.
     """
 
     metrics: Metrics
     runs: dict[str, Run] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
     signals: dict[str, dict[str, Array]] = field(default_factory=dict)
+    labels: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def whole(self) -> Measured:
         """Return the same results if the runs of all plans succeeded.
@@ -268,7 +271,9 @@ class Experiment(Displayed):
         with shared_forms():  # loops built for the plans differ in their sources only
             found, failures = _each(lambda name: self.run_plan(loop, name), list(self.plans))
         metrics = {name: values for name, (_, values) in found.items()}
-        return Measured(metrics, {name: run for name, (run, _) in found.items()}, failures)
+        runs = {name: run for name, (run, _) in found.items()}
+        labels = {name: (*run.outputs, *run.controls) for name, run in runs.items()}
+        return Measured(metrics, runs, failures, labels=labels)
 
     def run_plan(self, loop: System | Builder, name: str, params: Params | None = None) -> tuple[Run, dict[str, float]]:
         """Simulate a loop with one of the plans, and compute its metrics.
@@ -366,7 +371,8 @@ class Experiment(Displayed):
                 metrics[name] = own
         results: list[Measured | None] = [None] * len(alike)
         for i, metrics, curves in zip(usable, found, stored, strict=True):
-            results[i] = Measured(metrics, signals=curves)
+            labels = dict.fromkeys(metrics, (*tracked, *alike[0].acting))
+            results[i] = Measured(metrics, signals=curves, labels=labels)
         return results
 
     def metrics_of_runs(self, runs: Sequence[Run]) -> list[dict[str, float]]:

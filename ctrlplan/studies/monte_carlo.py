@@ -185,6 +185,9 @@ def monte_carlo(
 
 def _checked_draws(draws: Mapping[str, ArrayLike]) -> dict[str, Array]:
     check_kind(draws, "draws", Mapping, "a mapping of names to values, as the function draws returns it")
+    for name in draws:
+        if not isinstance(name, str):
+            raise TypeError(f"draws must have names of parameters as keys, got {name!r}")
     table = {name: np.atleast_1d(array_of_numbers(values, f"draws[{name!r}]")) for name, values in draws.items()}
     sizes = {name: values.shape for name, values in table.items()}
     if not table or len(set(sizes.values())) != 1 or any(len(shape) != 1 or not shape[0] for shape in sizes.values()):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,7 @@ from ctrlplan.studies.comparison import finite_or_none, shown_in_units
 from ctrlplan.studies.ensemble import Failure, numbers_shown
 from ctrlplan.studies.executing import Executed, Execution, executed
 from ctrlplan.studies.executors import Executor
-from ctrlplan.studies.experiment import Experiment, Metrics
+from ctrlplan.studies.experiment import Experiment, Measured, Metrics
 from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, shown_measures, wanted_measures
 from ctrlplan.studies.outcomes import Failed
 from ctrlplan.studies.roles import Role, role_of
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from ctrlplan.reports.style import AxesLike
 
 Array = NDArray[np.float64]
+_Outcome: TypeAlias = dict[str, tuple[dict[str, float], tuple[str, ...]]]
+"""Metrics, and labels of outputs and controls, by plan."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -336,9 +338,10 @@ def sweep(
     TypeError
         If `executor` has no ``submit``, or `build` is not a function.
     ValueError
-        If the values are not finite or do not increase, `build` cannot be sent to
-        other processes, or the checkpoint is that of another study. If all values
-        fail, the first exception is raised, SystemExit as a RuntimeError.
+        If the values are not finite or do not increase, `build` returns loops with
+        different outputs or controls or cannot be sent to other processes, or the
+        checkpoint is that of another study. If all values fail, the first exception
+        is raised, SystemExit as a RuntimeError.
     RuntimeError
         If a worker has other versions of ctrlplan or casadi.
     OSError
@@ -360,8 +363,8 @@ def sweep(
     The loop is sent to each worker once, a task has its values only. Values of a
     task whose worker ends are sent again, twice at most, one at a time, so that
     only the value that ends its worker has no result: see `Sweep.sent_again` and
-    `Sweep.missing`. A broken `concurrent.futures.ProcessPoolExecutor` is replaced
-    by one of the same size and start method. Nothing runs in this process
+    `Sweep.missing`. A broken process pool of `concurrent.futures` or loky is
+    replaced by one of the same size and start method. Nothing runs in this process
     instead. Results differ from those without an executor by rounding errors,
     1e-14 of the largest value.
 
@@ -398,22 +401,60 @@ def sweep(
     if not is_builder(build):
         raise TypeError(f"build must be a function of a value that returns a loop, got {type(build).__name__}")
     experiment = Experiment.from_arguments(locals())
-    outcomes: dict[int, Metrics | Failed] = {}
-    alike = None if units is not None else partial(_metrics_alike, experiment)
+    outcomes = _Outcomes(points)
+    alike = None if units is not None else partial(_outcomes_alike, experiment)
     first = FIRST if executor is None else FIRST_OF_TASK
-    runs = Batches(experiment, build, partial(_metrics, experiment, units), alike, first)
+    runs = Batches(experiment, build, partial(_outcome, experiment, units), alike, first)
 
     def identity() -> dict[str, object]:
         return {"kind": "sweep", "values": digest(points), "units": dict(units or {}), **experiment.identity()}
 
-    done = executed(runs, points.tolist(), outcomes.__setitem__, execution, parameter, identity)
+    done = executed(runs, points.tolist(), outcomes.add, execution, parameter, identity)
     done.raise_if_none_ran("build")
-    found = _swept(parameter, points, outcomes, done, experiment)
+    found = _swept(parameter, points, outcomes.metrics, done, experiment)
     found = _described(found, experiment, dict(units or {}))
     if found.interrupted:
         text = f"the sweep was interrupted: {found.values.size} of {points.size} values are returned"
         warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())
     return found
+
+
+class _Outcomes:
+    """Metrics of each value as they arrive, of loops with the same outputs and controls.
+
+    Attributes
+    ----------
+    metrics : dict of int to Metrics or Failed
+        Metrics by the number of the value.
+    """
+
+    def __init__(self, points: Array) -> None:
+        self.metrics: dict[int, Metrics | Failed] = {}
+        self._points = points
+        self._first: dict[str, tuple[int, tuple[str, ...]]] = {}
+
+    def add(self, k: int, outcome: _Outcome | Failed) -> None:
+        """Add the outcome of one value, in any order.
+
+        Raises
+        ------
+        ValueError
+            If its loop has other outputs or controls than those before it.
+        """
+        if isinstance(outcome, Failed):
+            self.metrics[k] = outcome
+            return
+        for plan, (_, labels) in outcome.items():
+            first, known = self._first.setdefault(plan, (k, labels))
+            if labels != known:
+                own, other = (
+                    f"{', '.join(names)} for {self._points[i]:g}" for i, names in ((k, labels), (first, known))
+                )
+                raise ValueError(
+                    f"build must return loops with the same outputs and controls for all values, "
+                    f"got {own} and {other}, with the plan {plan}; give outputs= and controls="
+                )
+        self.metrics[k] = {plan: metrics for plan, (metrics, _) in outcome.items()}
 
 
 def _checked_values(values: ArrayLike) -> Array:
@@ -471,17 +512,21 @@ def _controls_in(names: Iterable[Iterable[str]], experiment: Experiment) -> tupl
     return tuple(dict.fromkeys(found))
 
 
-def _metrics(experiment: Experiment, units: Mapping[str, str] | None, loop: System | Builder) -> Metrics:
-    """Metrics of one loop."""
+def _outcome(experiment: Experiment, units: Mapping[str, str] | None, loop: System | Builder) -> _Outcome:
+    """Outcome of one loop."""
     found = experiment.run(loop).whole()
     if units is not None:
         shown_in_units(experiment, found, units)
-    return found.metrics
+    return _of(found)
 
 
-def _metrics_alike(experiment: Experiment, loops: Sequence[Linear]) -> list[Metrics | None]:
-    """Metrics of linear loops of the same structure; None for those that must be run separately."""
-    return [None if one is None else one.metrics for one in experiment.run_alike(loops) or ()]
+def _outcomes_alike(experiment: Experiment, loops: Sequence[Linear]) -> list[_Outcome | None]:
+    """Outcomes of linear loops of the same structure; None for those that must be run separately."""
+    return [None if one is None else _of(one) for one in experiment.run_alike(loops) or ()]
+
+
+def _of(found: Measured) -> _Outcome:
+    return {plan: (metrics, found.labels[plan]) for plan, metrics in found.metrics.items()}
 
 
 def settling_jumps(values: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_]:

@@ -118,7 +118,7 @@ class Polytope:
             near = np.union1d(near, new)
             try:
                 factors, residual = nnls(every[:, near], column)
-            except RuntimeError:
+            except (RuntimeError, np.linalg.LinAlgError):
                 return None
             used = factors > 0.0
             near, generators = near[used], every[:, near[used]]

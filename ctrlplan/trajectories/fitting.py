@@ -11,14 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_count, checked_vector, real_array
 from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers
+from ctrlplan.trajectories.least_squares import LeastSquares, Solution, divided
 from ctrlplan.trajectories.piecewise_polynomial import PiecewisePolynomial
 from ctrlplan.trajectories.swing import MAXIMUM_SWING
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
 
-_MANY = 100
-"""Number of knots above which they are chosen by normal equations."""
+_MANY = 50
+"""Number of knots above which they are chosen by solutions with half of the digits."""
 
 _DEGREES = (1, 3, 3, 5, 5)
 """Degree of the spline by the highest continuous derivative; even degrees are ill-conditioned."""
@@ -49,7 +50,8 @@ def fit(
     With `tolerance` it is a least-squares spline (`make_lsq_spline`) whose knots, the
     same for all axes, are added where the deviation is larger. With `smoothing` it is,
     axis by axis, the smoothing spline of FITPACK (`splrep`) or, of continuity 0, a
-    least-squares spline with knots added until the sum is met. Knots are sample times.
+    least-squares spline with knots added until the sum is met. Knots are sample times,
+    at both ends as those of the interpolating spline (not-a-knot).
 
     Parameters
     ----------
@@ -125,7 +127,9 @@ def fit(
         splines = [_smooth(moments, row, degree, root) for row, root in zip(centred, roots.tolist(), strict=True)]
     else:
         splines = [_interpolating(moments, centred.T, degree)]
-    knots = np.unique(np.concatenate([spline.t for spline in splines]))
+    knots = splines[0].t[degree : splines[0].t.size - degree]
+    if len(splines) > 1:
+        knots = np.unique(np.concatenate([spline.t for spline in splines]))
     table = np.empty((degree + 1, knots.size - 1, len(rows)))
     for k in range(degree + 1):
         table[-1 - k] = np.concatenate([spline(knots[:-1], nu=k) for spline in splines], axis=1) / FACTORIALS[k]
@@ -298,32 +302,35 @@ def _within(times: Array, rows: Array, degree: int, limits: Array, *, mean: bool
 
     The limits are those of each sample or, with `mean`, of the root mean square.
     """
-    last = times.size - 1
-    chosen, precise = np.array([0, last]), False
-    # As many coefficients as samples are those of the interpolating spline.
-    while chosen.size - 1 + degree < times.size and limits.all():
-        knots = np.concatenate([times[[0] * degree], times[chosen], times[[last] * degree]])
-        quick = chosen.size > _MANY and not precise
+    problem = LeastSquares(times, rows, degree)
+    chosen, last = np.array([0, problem.places.size - 1]), problem.places.size - 1
+    if not mean and limits.all():
+        chosen = problem.first_knots(limits)
+    while chosen.size <= last and limits.all():  # all places are those of the interpolating spline
         try:
-            spline = _least_squares(times, rows.T, knots, degree, quick)
-        except np.linalg.LinAlgError:  # times that are spaced too unevenly for the normal equations
-            if not quick:
-                break
-            precise = True
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):
-            excess = (np.abs(spline(times) - rows.T) / (limits * (1.0 - _ROUNDING))).max(axis=1)
-            worst = _by_interval(excess, chosen, mean)
-            reached = (worst <= 1.0).all() or (mean and (excess**2).mean() <= 1.0)
-        if quick and (reached or not np.isfinite(worst).all()):  # these are the knots
-            precise = True
-            continue
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = problem.solve(problem.places[chosen])
+                if chosen.size <= _MANY:
+                    found = problem.corrected(found)
+                worst, reached = _judged(found, limits, mean)
+                if not found.is_correct and (reached or not np.isfinite(worst).all()):  # these are the knots
+                    found = problem.corrected(found)
+                    worst, reached = _judged(found, limits, mean)
+        except np.linalg.LinAlgError:
+            break
         if reached:
-            return spline
+            return found.spline()
         if not np.isfinite(worst).all():
             break
-        chosen = _divided(chosen, worst, degree)
+        chosen = divided(chosen, _parts(chosen, worst, degree))
     return _interpolating(times, rows.T, degree)
+
+
+def _judged(found: Solution, limits: Array, mean: bool) -> tuple[Array, bool]:
+    """Deviation of each interval relative to the limits, and whether they are kept."""
+    excess = (np.abs(found.deviations) / (limits * (1.0 - _ROUNDING))[:, None]).max(axis=0)
+    worst = _by_interval(excess, found.chosen, mean)
+    return worst, bool((worst <= 1.0).all() or (mean and (excess**2).mean() <= 1.0))
 
 
 def _by_interval(excess: Array, chosen: NDArray[np.intp], mean: bool) -> Array:
@@ -335,34 +342,26 @@ def _by_interval(excess: Array, chosen: NDArray[np.intp], mean: bool) -> Array:
     return np.sqrt(np.add.reduceat(excess**2, chosen[:-1]) / sizes)
 
 
-def _least_squares(times: Array, columns: Array, knots: Array, degree: int, quick: bool) -> BSpline:
-    """Spline of least squares; quickly by normal equations, which have half of the digits.
+def _parts(chosen: NDArray[np.intp], worst: Array, degree: int) -> NDArray[np.intp]:
+    """Numbers of parts of intervals where the relative deviations exceed 1.
 
-    The QR decomposition of scipy takes up to fifty times as long where knots are many.
+    A deviation is proportional to the power degree + 1 of the length of an interval. If
+    there is a single sample between knots, the nearest intervals with more are divided.
     """
-    from scipy.interpolate import BSpline, make_lsq_spline
-    from scipy.linalg import solveh_banded
-
-    if not quick:
-        return make_lsq_spline(times, columns, knots, k=degree)
-    design = BSpline.design_matrix(times, knots, degree)
-    products = design.T @ design
-    bands = np.zeros((degree + 1, products.shape[0]))
-    for k, band in enumerate(bands):
-        band[: band.size - k] = products.diagonal(k)
-    return BSpline(knots, solveh_banded(bands, design.T @ columns, lower=True), degree)
-
-
-def _divided(chosen: NDArray[np.intp], worst: Array, degree: int) -> NDArray[np.intp]:
-    """Numbers of the samples at knots, with more of them where the relative deviations exceed 1.
-
-    A deviation is proportional to the power degree + 1 of the length of an interval.
-    """
-    lengths = np.diff(chosen)
-    parts = np.where(worst > 1.0, np.ceil(worst ** (1.0 / (degree + 1))).clip(2.0, _PARTS), 1.0).astype(int)
-    while not (np.minimum(parts, lengths) > 1).any():  # a single sample between knots: divide the intervals next to it
-        parts = np.maximum(parts, np.maximum(np.append(parts[1:], 1), np.append(1, parts[:-1])))
-    parts = np.minimum(parts, lengths)
-    number = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
-    inner = np.repeat(chosen[:-1], parts) + number * np.repeat(lengths, parts) // np.repeat(parts, parts)
-    return np.append(inner, chosen[-1])
+    several, exceeds = chosen[1:] - chosen[:-1] > 1, worst > 1.0
+    wanted = np.minimum(np.maximum(np.ceil(worst ** (1.0 / (degree + 1))), 2.0), _PARTS)
+    parts = np.where(exceeds, wanted, 1.0).astype(int)
+    active = exceeds & several
+    served = active.copy()
+    served[1:] |= active[:-1]
+    served[:-1] |= active[1:]
+    waiting = np.flatnonzero(exceeds & ~served)
+    if waiting.size:
+        numbers = np.arange(parts.size)
+        before = np.maximum.accumulate(np.where(several, numbers, -parts.size))[waiting]
+        after = np.minimum.accumulate(np.where(several, numbers, 2 * parts.size)[::-1])[::-1][waiting]
+        nearer = waiting - before <= after - waiting
+        np.maximum.at(parts, before[nearer], parts[waiting[nearer]])
+        nearer = waiting - before >= after - waiting
+        np.maximum.at(parts, after[nearer], parts[waiting[nearer]])
+    return parts

@@ -70,15 +70,15 @@ def test_many_states_and_segments(states, segments, benchmark, capsys, monkeypat
         )
 
 
-def beside_peer(system, samples, benchmark, capsys):
-    """Print the ratio of CPU times at the times T, interleaved, and check that both responses are equal."""
+def beside_peer(system, samples, benchmark, capsys, times=T, equal=None):
+    """Print the ratio of CPU times, interleaved, and check the response by the peer's of an equal system."""
     ready = cp.prepare(system)
 
     def ours():
-        return cp.simulate(ready, T, samples)
+        return cp.simulate(ready, times, samples)
 
     def peer():
-        return ct.forced_response(system, T, samples)
+        return ct.forced_response(system, times, samples)
 
     benchmark.pedantic(ours, rounds=3, warmup_rounds=1)
     rows = []
@@ -91,10 +91,12 @@ def beside_peer(system, samples, benchmark, capsys):
         rows.append(seconds)
     own, other = (min(column) for column in zip(*rows, strict=True))
     benchmark.extra_info["ratio"] = own / other
+    if equal is not None:
+        results[1] = ct.forced_response(equal, times, samples).outputs
     assert np.abs(results[0] - results[1]).max() <= 1e-11 * np.abs(results[1]).max()
     with capsys.disabled():
         print(
-            f"\n{system.nstates} states, samples of {system.ninputs} inputs: {1e3 * own:.1f} ms, peer "
+            f"\n{system.nstates} states, {times.size} samples of {system.ninputs} inputs: {1e3 * own:.1f} ms, peer "
             f"{1e3 * other:.1f} ms, ratio {own / other:.2f}"
         )
 
@@ -121,3 +123,58 @@ def test_samples_of_many_inputs(states, inputs, outputs, kind, benchmark, capsys
     rates = 0.05 * (1.0 + np.arange(inputs))[:, None]
     samples = np.sin(rates * T) if kind == "smooth" else rng.standard_normal((inputs, T.size))
     beside_peer(system, samples, benchmark, capsys)
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("kind", ["chain", "badly scaled", "stiff"])
+@pytest.mark.parametrize("inputs", [1, 5])
+@pytest.mark.parametrize("states", [50, 100, 200, 300])
+@pytest.mark.parametrize("count", [50, 200, 5000])
+def test_few_and_many_samples(states, inputs, count, kind, benchmark, capsys):
+    """Random samples: few of them, where the exponential is most of the work, and many. Goal: at most 1."""
+    rng = np.random.default_rng(2)
+    a, b, c, scale = chain(states // 2).A, rng.standard_normal((states, inputs)), np.eye(1, states), np.ones(states)
+    if kind == "badly scaled":
+        scale = rng.permutation(np.geomspace(1e-5, 1e5, states))
+    elif kind == "stiff":
+        turn = np.linalg.qr(rng.standard_normal((states, states)))[0]
+        a = -turn @ np.diag(np.geomspace(0.1, 1e3, states)) @ turn.T
+    system = ct.ss(a * (scale[:, None] / scale), b * scale[:, None], c / scale, 0)
+    samples, times = rng.standard_normal((inputs, count)), np.linspace(0.0, 10.0, count)
+    beside_peer(system, samples, benchmark, capsys, times, ct.ss(a, b, c, 0))
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("segments", [10, 137])
+def test_stiff_loop_along_segments(segments, benchmark, capsys, monkeypatch):
+    """50 lags with rates up to 1e4 1/s, 201 samples: the breakpoints lie between them. Printed next to the peer."""
+    turn = np.linalg.qr(np.random.default_rng(2).standard_normal((50, 50)))[0]
+    a = -turn @ np.diag(np.geomspace(0.1, 1e4, 50)) @ turn.T
+    system, move, times = ct.ss(a, turn[:, :1], np.eye(1, 50), 0, inputs="r", outputs="y"), plan(segments), T[::5]
+    ready = cp.prepare(system)
+
+    def ours():
+        return cp.simulate(ready, times, move)
+
+    def peer():
+        return ct.forced_response(system, times, move(times))
+
+    found = benchmark.pedantic(ours, rounds=3, warmup_rounds=1)
+    seconds = []
+    for function in (ours, peer):
+        begin = process_time()
+        function()
+        seconds.append(process_time() - begin)
+    monkeypatch.setattr(exact, "_MANY_STATES", 10**9)
+    monkeypatch.setattr(exact, "_MANY_SEGMENTS", 10**9)
+    begin = process_time()
+    slow = cp.simulate(ready, times, move)
+    before = process_time() - begin
+    error = np.abs(slow.states - found.states).max() / np.abs(slow.states).max()
+    # Half an ulp of the largest rate moves the slow ones by 1e-12.
+    assert error <= 1e-11
+    with capsys.disabled():
+        print(
+            f"\nstiff, {segments} segments: {1e3 * seconds[0]:.1f} ms, peer {1e3 * seconds[1]:.1f} ms, "
+            f"by segments {1e3 * before:.0f} ms, difference {error:.1e}"
+        )

@@ -246,6 +246,40 @@ def test_fit_near_the_noise_beside_least_squares(benchmark, capsys):
     report(capsys, benchmark, "fit near the noise next to make_lsq_spline of the same knots", times, sizes)
 
 
+def knots_of_scipy(t, y, tolerance):
+    """Spline on the first knots of the search of FITPACK whose largest deviation is within a tolerance."""
+    from scipy.interpolate import generate_knots  # from scipy 1.15 on
+
+    for knots in generate_knots(t, y, k=3, s=1e-30):
+        spline = make_lsq_spline(t, y, knots, k=3)
+        if np.abs(spline(t) - y).max() <= tolerance:
+            break
+    return spline
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("tolerance", [1e-3, 2e-3, 4e-3])
+def test_fit_near_the_noise_beside_knots_of_scipy(tolerance, benchmark, capsys):
+    """Noise of 1e-3. Peer: the search of scipy for knots, `generate_knots`, to the same largest deviation."""
+    times, knots, sizes = [], [], (200, 1000)
+    for n in sizes:
+        t = np.linspace(0.0, 10.0, n)
+        y = np.sin(t) + np.random.default_rng(1).normal(scale=1e-3, size=n)
+
+        def ours(t=t, y=y):
+            return cp.fit(t, y, tolerance=tolerance)
+
+        def peer(t=t, y=y):
+            return knots_of_scipy(t, y, tolerance)
+
+        assert ours().deviation[0] <= tolerance >= np.abs(peer()(t) - y).max()
+        knots.append(f"{ours().breakpoints.size} for {peer().t.size - 6}")
+        times.append(seconds((ours, peer), 1))
+    benchmark.pedantic(ours, rounds=1)
+    title = f"fit to {tolerance:g} next to generate_knots (knots: {', '.join(knots)})"
+    report(capsys, benchmark, title, times, sizes)
+
+
 @pytest.mark.benchmark
 def test_growth_of_what_uses_a_plan(benchmark, capsys, tmp_path):
     """Two decades of segments: each of these is to grow by about a hundred, and memory as well."""

@@ -513,16 +513,19 @@ def test_a_result_says_nothing_where_it_is_used_as_one():
         found.way  # noqa: B018
 
 
-def test_least_squares_that_do_not_end_are_solved_otherwise(monkeypatch):
-    """Some releases of scipy solve normal equations and give up: the plan is the same."""
+@pytest.mark.parametrize(
+    "error", [RuntimeError("Maximum number of iterations reached."), np.linalg.LinAlgError("singular")]
+)
+def test_least_squares_that_fail_are_solved_otherwise(monkeypatch, error):
+    """Some releases of scipy solve normal equations, and do not end or meet a singular matrix: the plan is the same."""
     obstacles, crane = [Disc((10.0, 5.0), 1.0)], Crane()
     move = cp.PolySpline([cp.Waypoint(0, [0, 10], 0, 0, 0, 0), cp.Waypoint(16, [20, 11], 0, 0, 0, 0)])
     expected = avoid(move, obstacles, clearance=0.2, rope=crane.rope()).plan
 
-    def endless(matrix, right, maxiter):
-        raise RuntimeError("Maximum number of iterations reached.")
+    def failing(matrix, right, maxiter):
+        raise error
 
-    monkeypatch.setattr(inequalities, "nnls", endless)
+    monkeypatch.setattr(inequalities, "nnls", failing)
     found = avoid(move, obstacles, clearance=0.2, rope=crane.rope()).plan
     assert [point.time for point in found.waypoints] == pytest.approx([point.time for point in expected.waypoints])
     times = np.linspace(0.0, 16.0, 101)

@@ -65,6 +65,13 @@ def test_draws_are_a_mapping(params):
         run(lag(), params)
 
 
+@pytest.mark.parametrize("build", [lag(), lambda **values: lag()])
+@pytest.mark.parametrize("name", [1, None, ("tau",)])
+def test_names_of_draws_are_text(build, name):
+    with pytest.raises(TypeError, match=r"draws must have names of parameters as keys, got "):
+        run(build, {name: [1.0, 2.0]})
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_draws_are_finite(value):
     with pytest.raises(ValueError, match=r"draws must be finite, got draws\['tau'\]\[1\] = (nan|inf|-inf)$"):

@@ -328,6 +328,33 @@ def test_a_killed_worker_is_replaced_and_only_the_value_that_killed_it_is_missin
     assert found["lambda"].startswith("build must be picklable for other processes, got ")
 
 
+LOKY = """
+import loky
+
+def build(rate):
+    if rate == 4.0:
+        os._exit(9)
+    return lag(rate)
+
+if __name__ == "__main__":
+    found = [
+        said_of(*swept(build, np.arange(1.0, 8.0), loky.get_reusable_executor(max_workers=2, timeout=60))),
+        said_of(*swept(build, np.arange(1.0, 8.0), loky.ProcessPoolExecutor(1))),
+    ]
+    print(json.dumps(found))
+"""
+
+
+@pytest.mark.slow
+def test_a_broken_pool_of_another_library_is_replaced(tmp_path):
+    """Its workers fork from a process of their own, its pools have other arguments, and no ``cancel_futures``."""
+    for found in run(tmp_path, LOKY):
+        assert found["missing"] == [4.0]
+        assert found["settling"][:3] + found["settling"][4:] == settling([1, 2, 3, 5, 6, 7])
+        assert [k for k, _ in found["failures"]] == [3]
+        assert not found["interrupted"]
+
+
 PROCESSES = """
 def build(rate):
     if rate in (1.0, 6.0):
@@ -448,7 +475,9 @@ if __name__ == "__main__":
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
         for name, executor in (("client", client), ("executor", client.get_executor())):
             seen = Seen(executor, name)
-            found["interrupted"].append(said_of(*swept(partial(build, name), np.arange(1.0, 101.0), seen, chunk=1)))
+            # All tasks are submitted, and half of them carry the loop: tasks without it end early on a worker without.
+            options = {"chunk": 1, "workers": 50}
+            found["interrupted"].append(said_of(*swept(partial(build, name), np.arange(1.0, 101.0), seen, **options)))
             (HERE / f"go on {name}").touch()
             found["left"].append(tasks(client))
         found["lambda"] = said_of(*swept(lambda rate: lag(rate), [1.0, 2.0, 3.0], client))

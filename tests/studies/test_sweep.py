@@ -405,6 +405,47 @@ def test_plans_as_blocks_are_swept_too():
     np.testing.assert_allclose(found.metrics["step"]["overshoot_error"], expected, rtol=1e-5)
 
 
+def own_signals(value):
+    """Loops whose outputs or controls depend on the value, by kind."""
+    other, gains = value > 1.5, [[1.0], [2.0]]
+    matrices = [[-value]], [[value]]
+    cubic = {"inputs": "r", "states": 1}
+    return {
+        "output": ct.tf([value], [1.0, 2.0, value], inputs="r", outputs="z" if other else "y"),
+        "control": ct.ss(*matrices, gains, 0.0, inputs="r", outputs=["y", "v" if other else "u"]),
+        "further control": ct.ss(
+            *matrices, gains[: 2 if other else 1], 0.0, inputs="r", outputs=["y", "u"][: 1 + other]
+        ),
+        "nonlinear": ct.nlsys(lambda t, x, u, p: u - x**3, None, outputs="z" if other else "y", **cubic),
+    }
+
+
+@pytest.mark.parametrize("kind", own_signals(1.0))
+@pytest.mark.parametrize("executor", [None, lambda: ThreadPoolExecutor(2)], ids=["here", "threads"])
+def test_loops_with_different_signals_are_an_error(kind, executor):
+    plans, times = {"step": cp.Step(1.0)}, np.linspace(0.0, 5.0, 101)
+    options = {"progress": False, "executor": executor and executor()}
+    said = r"build must return loops with the same outputs and controls for all values, got [yzuv, ]+ for [1-3] and"
+    with pytest.raises(ValueError, match=said):
+        cp.sweep(lambda value: own_signals(value)[kind], [1.0, 2.0, 3.0], plans, times, **options)
+    cp.sweep(lambda value: own_signals(value)[kind], [2.0, 3.0], plans, times, **options)
+
+
+@pytest.mark.parametrize("measures", [["iae"], ["control_peak"], None])
+def test_an_order_of_outputs_that_depends_on_the_value(measures):
+    """Signals are known by their labels, for loops solved together and for others."""
+
+    def build(value, order=1):
+        return ct.ss([[-value]], [[value]], [[1.0], [2.0]][::order], 0.0, inputs="r", outputs=["y", "u"][::order])
+
+    plans, times = {"step": cp.Step(1.0)}, np.linspace(0.0, 5.0, 101)
+    values = np.arange(1.0, 8.0)
+    found = cp.sweep(lambda v: build(v, -1 if v > 3.5 else 1), values, plans, times, measures=measures, progress=False)
+    expected = cp.sweep(build, values, plans, times, measures=measures, progress=False)
+    for name, row in expected.metrics["step"].items():
+        np.testing.assert_allclose(found.metrics["step"][name], row, rtol=1e-12)
+
+
 def test_an_option_that_there_is_not():
     with pytest.raises(TypeError, match="bandwidth"):
         cp.sweep(BUILD, GAINS, PLANS, TIMES, progress=False, bandwidth=0.1)

@@ -7,6 +7,7 @@ from multiprocessing import get_context
 from types import SimpleNamespace
 
 import control as ct
+import loky
 import numpy as np
 import pytest
 
@@ -224,6 +225,26 @@ def test_a_new_pool_has_the_size_and_start_method_of_the_broken_one():
     assert executors.new_pool(ThreadPoolExecutor(1)) is None
 
 
+def test_a_new_pool_is_of_the_library_of_the_broken_one():
+    with loky.ProcessPoolExecutor(3, timeout=7.0, initializer=print, initargs=(1,), env={"A": "1"}) as pool:
+        new = executors.new_pool(pool)
+        names = ("_max_workers", "_timeout", "_initializer", "_initargs", "_env", "_context")
+        assert [getattr(new, name) for name in names] == [getattr(pool, name) for name in names]
+        assert type(new) is type(pool)
+        new.shutdown()
+
+
+def test_an_executor_whose_submit_returns_no_future():
+    class Silent:
+        _max_workers = 2
+
+        def submit(self, function, task):
+            return None
+
+    with pytest.raises(RuntimeError, match="submit of the executor must return a future with result, got None"):
+        cp.sweep(lag, RATES, PLANS, TIMES, executor=Silent(), progress=False)
+
+
 class Breaking(Workers):
     """Pool whose worker ends at some values; it then takes no more tasks, and all that it has are lost."""
 
@@ -246,7 +267,7 @@ class Breaking(Workers):
         return super().run(k)
 
     def shutdown(self, **options):
-        assert options == {"wait": False, "cancel_futures": True}
+        assert options == {"wait": False}  # what every process pool takes
         self.ended += 1
 
 

@@ -373,14 +373,61 @@ def test_smoothing_holds_wherever_there_is_a_plan(continuity, total):
         assert ((plan(UNEVEN) - values) ** 2).sum() <= total
 
 
+@pytest.mark.parametrize(("continuity", "degree"), [(1, 3), (4, 5)])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_least_squares_of_the_knots(continuity, degree, offset):
+    """Oracle: the QR decomposition of scipy; both are exact to rounding times the condition number."""
+    rng = np.random.default_rng(3)
+    t = np.sort(rng.uniform(0.0, 10.0, 700))
+    y = np.sin([t, 2.0 * t]) + rng.normal(scale=1e-3, size=(2, t.size)) + offset
+    plan = cp.fit(t, y, tolerance=[2e-3, 1.5e-3], continuity=continuity)
+    knots = np.concatenate([[t[0]] * degree, plan.breakpoints, [t[-1]] * degree])
+    oracle = si.make_lsq_spline(t, y.T - offset, knots, k=degree)
+    assert 60 < plan.breakpoints.size < t.size
+    np.testing.assert_allclose(plan(t), oracle(t).T + offset, rtol=0, atol=1e-11 + 4.0 * np.spacing(offset))
+
+
+@pytest.mark.parametrize(("continuity", "half"), [(2, 2), (4, 3)])
+def test_few_samples_for_the_frequency_are_followed_to_the_ends(continuity, half):
+    """Knots at all samples of an end do not determine the derivatives there: such plans swung by powers of ten."""
+    t = np.sort(np.random.default_rng([200, 1, 6]).uniform(0.0, 10.0, 200))
+    y = np.sin(t) + 0.2 * np.sin(5.0 * t) + 0.1 * np.sin(t**2.2)
+    plan = cp.fit(t, y, tolerance=1e-3, continuity=continuity)
+    assert not np.isin(np.append(t[1:half], t[-half:-1]), plan.breakpoints).any()
+    assert np.abs(plan(np.linspace(t[0], t[-1], 5001))).max() <= 2.0
+
+
+@pytest.mark.parametrize("continuity", [0, 2, 4])
+def test_overflow_of_a_fit_is_an_error_and_no_warning(continuity):
+    t = np.linspace(0.0, 10.0, 500)
+    values = 5e306 * (np.sin(t) + 1e-3 * np.random.default_rng(0).normal(size=t.size))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ValueError, match="coefficients must be finite"):
+            cp.fit(t, values, tolerance=1e304, continuity=continuity)
+        small = cp.fit(t, values / 1e300, tolerance=1e4, continuity=continuity)
+    assert np.abs(small(t) - values / 1e300).max() <= 1e4
+
+
+@pytest.mark.parametrize("size", [6, 7, 8, 9, 12])
+def test_tolerances_of_few_samples(size):
+    values = np.random.default_rng(size).normal(size=size)
+    for tolerance in (1e-9, 0.1, 1.0, 10.0):
+        for continuity in range(5):
+            plan = cp.fit(np.arange(size), values, tolerance=tolerance, continuity=continuity, warn=False)
+            assert plan.deviation[0] <= tolerance
+            assert np.abs(plan(np.arange(size)) - values).max() <= tolerance
+
+
+@pytest.mark.skipif(not hasattr(si, "generate_knots"), reason="least squares by QR came with scipy 1.15")
 def test_rounding_of_a_least_squares_spline_is_not_said_to_be_of_all_samples():
     """Quintics with large coefficients between pairs of near samples, and few knots in a long constant part."""
-    times = np.append(np.ravel([(k, k + 1e-6) for k in range(10)]), np.linspace(11.0, 20.0, 91))
+    times = np.append(np.ravel([(k, k + 1e-9) for k in range(10)]), np.linspace(11.0, 20.0, 91))
     values = np.append(np.resize([0.0, 1.0], 20), np.zeros(91))
     with pytest.raises(
-        ValueError, match=r"the polynomials of degree 5 in the \d\d segments of axis 0, got 0.01; use"
+        ValueError, match=r"the polynomials of degree 5 in the \d\d segments of axis 0, got 1e-06; use"
     ) as e:
-        cp.fit(times, values, tolerance=0.01, continuity=4, warn=False)
+        cp.fit(times, values, tolerance=1e-6, continuity=4, warn=False)
     assert "samples" not in str(e.value)
     plan = cp.fit(times, values, tolerance=0.01, continuity=0)
     assert np.abs(plan(times) - values).max() <= 0.01

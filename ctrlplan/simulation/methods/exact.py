@@ -75,8 +75,8 @@ def _run_sampled(job: Job, form: SampledForm) -> Record:
         times = np.union1d(times, motion.instants.times)
 
     def snapshot(t: Array, x: Array) -> Snapshot:
-        registers = known[n:] if t is times else motion.registers_at(t)
-        z, w = np.concatenate([x, registers]), signal_values(time_signals, t)
+        z = known if t is times else np.concatenate([x, motion.registers_at(t)])
+        w = signal_values(time_signals, t)
 
         def signals() -> Array:
             return np.asarray(form.signals_z @ z + form.signals_w @ w)
@@ -156,16 +156,16 @@ def _run(job: Job, form: LinearForm) -> Record:
 
     def states_at(t: Array, state: Array, a: Array = form.a) -> Array:
         if sampled.size and sampled.all():
-            return _finite(sampled_states(a, form.b, signal_values(time_signals, t), t, state))
+            return _finite(sampled_states(a, form.b, signal_values(time_signals, t), t, state, form.scale))
         found = None
         if len(a) > _MANY_STATES or (len(a) and len(breakpoints) > _MANY_SEGMENTS):
             values = partial(signal_values, planned)
-            found = moment_states(a, form.b[:, ~sampled], values, np.array(breakpoints), t, state)
+            found = moment_states(a, form.b[:, ~sampled], values, np.array(breakpoints), t, state, form.scale)
         if found is None:
             found = exact_states(a, form.b[:, ~sampled], jet, breakpoints, t, state)
         if sampled.any():  # superposition of the responses to plans and to samples
             samples = signal_values(time_signals, t)[sampled]
-            found = found + sampled_states(a, form.b[:, sampled], samples, t, np.zeros_like(state))
+            found = found + sampled_states(a, form.b[:, sampled], samples, t, np.zeros_like(state), form.scale)
         return _finite(found)
 
     def interpolate(k: int, t: float) -> Array:
