@@ -10,13 +10,30 @@ from ctrlplan._types import Array
 from ctrlplan.simulation.signals import Series
 
 
-class DelayedSignal:
-    """Delayed signals, stored as Chebyshev series by segments."""
+class DelayOutput:
+    """Outputs of a delay as functions of time.
+
+    Parameters
+    ----------
+    delay : float
+        Delay [s].
+    initial : ndarray, shape (width,)
+        Values until the first input has passed.
+    first : float
+        Start of the run [s].
+    """
 
     def __init__(self, delay: float, initial: Array, first: float) -> None:
         self.delay, self.width = delay, initial.size
         self.tolerance = 0.0
         self._initial, self._first = initial, first
+
+
+class DelayedSignal(DelayOutput):
+    """Delayed signals that become known during a run, stored as Chebyshev series by segments."""
+
+    def __init__(self, delay: float, initial: Array, first: float) -> None:
+        super().__init__(delay, initial, first)
         self._pieces: list[Series] = []
         self._ends: list[float] = []
 

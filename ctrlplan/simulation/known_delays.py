@@ -11,12 +11,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ctrlplan._types import Array
-from ctrlplan.simulation.delayed_signals import DelayedSignal, HeldDelaySignal
+from ctrlplan.simulation.delayed_signals import DelayedSignal, DelayOutput, HeldDelaySignal
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.signals import PlanSignal, SampledSignal, TimeSignal, after_marks
 
 
-class KnownDelaySignal(DelayedSignal):
+class KnownDelaySignal(DelayOutput):
     """Delayed linear combinations of functions of time.
 
     Parameters
@@ -63,7 +63,7 @@ class KnownDelaySignal(DelayedSignal):
                 low, high = low + bound.min(axis=0), high + bound.max(axis=0)
         return low, high
 
-    def ends(self, left: float, right: float) -> tuple[Array, Array] | None:  # type: ignore[override]
+    def ends(self, left: float, right: float) -> tuple[Array, Array] | None:
         """Values at both ends of a segment if all functions of time are straight lines there."""
         if 0.5 * (left + right) - self.delay < self._first:
             return self._initial, self._initial
@@ -96,11 +96,6 @@ class KnownDelaySignal(DelayedSignal):
             for k, j in zip(*np.nonzero(weights), strict=True):
                 total[k] += weights[k, j] * rows[j]
         return total
-
-
-def is_found_in_run(signal: TimeSignal) -> bool:
-    """Whether a function of time becomes known during a run only."""
-    return isinstance(signal, DelayedSignal) and not isinstance(signal, KnownDelaySignal)
 
 
 def with_known_delays(network: Network, signals: Sequence[TimeSignal], first: float) -> list[TimeSignal]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan.simulation.delayed_signals import DelayedSignal, HeldDelaySignal
-from ctrlplan.simulation.known_delays import is_found_in_run
+from ctrlplan.simulation.known_delays import KnownDelaySignal
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.signals import TimeSignal
 
@@ -41,11 +41,11 @@ def longest_segment(network: Network, delays: list[float], duration: float) -> f
 
 def warn_of_short_delays(network: Network, time_signals: Sequence[TimeSignal], duration: float) -> None:
     """Warn of a delay that divides a run into very many segments."""
-    late = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
+    late = [signal for signal in time_signals if isinstance(signal, DelayedSignal | KnownDelaySignal)]
     lengths = [
         (signal.delay, network.blocks[i].name)
         for signal, i in zip(late, network.blocks_with("delay"), strict=True)
-        if is_found_in_run(signal) and not isinstance(signal, HeldDelaySignal)
+        if isinstance(signal, DelayedSignal) and not isinstance(signal, HeldDelaySignal)
     ]
     delay, name = min(lengths, default=(math.inf, ""))
     if _SHORTEST_DELAY * duration <= delay < _SHORT_DELAY * duration:

@@ -18,7 +18,7 @@ from ctrlplan._types import Array
 from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.delayed_signals import DelayedSignal, HeldDelaySignal
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
-from ctrlplan.simulation.known_delays import is_found_in_run
+from ctrlplan.simulation.known_delays import KnownDelaySignal
 from ctrlplan.simulation.network import Block, Network
 from ctrlplan.simulation.scales import in_turn
 from ctrlplan.simulation.segment_lengths import longest_segment
@@ -338,9 +338,9 @@ class _Memory:
     """
 
     def __init__(self, network: Network, solver: Solver, time_signals: TimeSignals, resolution: float) -> None:
-        late = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
+        late = [signal for signal in time_signals if isinstance(signal, DelayedSignal | KnownDelaySignal)]
         pairs = list(zip(late, network.blocks_with("delay"), strict=True))
-        self._every = [signal for signal in late if is_found_in_run(signal)]
+        self._every = [signal for signal in late if isinstance(signal, DelayedSignal)]
         self._all_time_signals = time_signals
         self._held = [(signal, network.fed[i]) for signal, i in pairs if isinstance(signal, HeldDelaySignal)]
         self._time_signals = [signal for signal in self._every if not isinstance(signal, HeldDelaySignal)]
@@ -510,7 +510,7 @@ class _Schedule:
         times, values = self._ahead
         k = int(times.searchsorted(t - self._tolerance))
         if k == times.size or times[k] > t + self._tolerance:
-            count = 0 if any(map(is_found_in_run, self._time_signals)) else _AHEAD
+            count = 0 if any(isinstance(signal, DelayedSignal) for signal in self._time_signals) else _AHEAD
             times = np.array([t, *self.samples.following(count, self._fixed[-1])])
             values, k = values_after(self._time_signals, times, self._tolerance), 0
             self._ahead = times, values
@@ -521,7 +521,7 @@ class _Schedule:
         self._fixed, self._ahead = [*fixed, last], (np.empty(0), np.empty((0, 0)))
         self._tolerance = time_tolerance(first, last)
         for signal in self._time_signals:
-            if isinstance(signal, DelayedSignal):
+            if isinstance(signal, DelayedSignal | KnownDelaySignal):
                 signal.tolerance = self._tolerance
 
 
@@ -620,10 +620,11 @@ def as_fraction(seconds: float) -> Fraction:
 
 def known_before(time_signals: TimeSignals, times: Array) -> Array:
     """Signals (nsignals, ntime) that are known before a run; 0 for what becomes known during it."""
-    if not any(map(is_found_in_run, time_signals)):
+    if not any(isinstance(signal, DelayedSignal) for signal in time_signals):
         return time_signals.at(times)
     rows = [
-        np.zeros((signal.width, times.size)) if is_found_in_run(signal) else signal.at(times) for signal in time_signals
+        np.zeros((signal.width, times.size)) if isinstance(signal, DelayedSignal) else signal.at(times)
+        for signal in time_signals
     ]
     return np.concatenate([np.zeros((0, times.size)), *rows])
 
