@@ -218,10 +218,10 @@ def plot_paths(comparison: Comparison, wall: Wall = None, *, ax: AxesLike | None
     if wall:
         axes.text(*_draw_wall(axes, wall, 0.267), "wall", ha="center", fontsize=font_size(9))
     draw_paths(axes, comparison, _PLANE)
+    axes.yaxis.set_inverted(True)
     mark_waypoints(axes, comparison, _PLANE)
     drawing.label_x("x [m]")
     label_y(axes, "z [m], down")
-    axes.yaxis.set_inverted(True)
     return drawing.finish()
 
 

@@ -371,7 +371,8 @@ _LIMIT_POINT = "#E69F00"
 def _mark_point(axes: Axes, point: tuple[float, float], label: str) -> None:
     """Star at a limit point, and what it is to the right of it."""
     axes.plot(*point, "*", color=_LIMIT_POINT, markersize=marker_size(12), zorder=5)
-    axes.annotate(as_text(label), point, xytext=(9, -2), textcoords="offset points", fontsize=font_size(8))
+    text = axes.annotate(as_text(label), point, xytext=(9, -2), textcoords="offset points", fontsize=font_size(8))
+    text.set_bbox({"facecolor": axes.get_facecolor(), "edgecolor": "none", "alpha": 0.75, "pad": 1.0})
 
 
 def _number_point(axes: Axes, sweep: Sweep, plan: str, value: float, place: Place, colour: str) -> None:

@@ -81,15 +81,24 @@ def draw_paths(axes: Axes, comparison: Comparison, outputs: tuple[str, str]) -> 
 
 
 _GOAL = "goal"
-_PLACES = {_GOAL: ((-6.0, -10.0), "right")}
-"""Offset [pt] and alignment of a name where they are not those of the others."""
+_SIDES = {_GOAL: (-6.0, "right")}
+"""Offset to the right [pt] and alignment of a name where they are not those of the others."""
+
+_BELOW = 14.0
+"""Height above the lower edge [pt] from which on a point has its name below."""
 
 
 def mark_waypoints(axes: Axes, comparison: Comparison, outputs: tuple[str, str]) -> None:
-    """Waypoints with their names."""
-    for text, place in named_places(comparison, outputs).items():
+    """Waypoints with their names, which do not cross the lower edge."""
+    named = named_places(comparison, outputs)
+    for place in named.values():
         axes.plot(*place, "o", color=shade(0.73), mfc=axes.get_facecolor(), zorder=5)
-        offset, side = _PLACES.get(text, ((6.0, -10.0), "left"))
+    bottom, top = axes.get_ylim()
+    points = axes.bbox.height * 72.0 / axes.figure.dpi
+    for text, place in named.items():
+        height = points * (place[1] - bottom) / (top - bottom)
+        across, side = _SIDES.get(text, (6.0, "left"))
+        offset = (across, -10.0 if height > _BELOW else 5.0)
         axes.annotate(text, place, xytext=offset, textcoords="offset points", ha=side, fontsize=font_size(9))
 
 

@@ -157,6 +157,19 @@ def test_any_number_of_waypoints_is_named(inner):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("places", [((0.0, 10.0), (20.0, 11.0)), ((0.0, 11.0), (20.0, 10.0))])
+def test_names_of_waypoints_do_not_cross_the_edge(places):
+    """z points down: the deeper end is next to the lower edge."""
+    (axes,) = plot_paths(compared(points(*places)), None).axes.flat
+    axes.figure.set_size_inches(4.0, 2.5)
+    axes.figure.canvas.draw()
+    names = [text for text in axes.texts if text.get_text() in ("start", "goal")]
+    assert len(names) == 2
+    for text in names:
+        assert text.get_window_extent().y0 > axes.bbox.y0, text.get_text()
+
+
+@pytest.mark.slow
 def test_waypoints_given_in_part_are_not_marked():
     free = [MOVE[0], cp.Waypoint.from_jets(3.0, x=[math.nan, 1.0], z=[7.0, math.nan]), *MOVE[1:]]
     found = compared(MOVE, {"polynomial": cp.PolySpline(free)})
