@@ -110,13 +110,14 @@ class Checkpoint:
         for path in sorted(self.folder.glob(_OUTCOMES)):
             try:
                 with np.load(io.BytesIO(path.read_bytes())) as file:
-                    stored, data = json.loads(str(file["outcomes"])), file["data"]
-            except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+                    found, data = json.loads(file["outcomes"].tobytes()), file["data"]
+                    stored, names = found["outcomes"], found["names"]
+            except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
                 raise ValueError(f"checkpoint must have complete files, got {path}: {error}; delete it") from error
             for number, outcome in stored:
                 if number not in seen:
                     seen.add(number)
-                    yield number, _restored(outcome, data)
+                    yield number, _restored(outcome, names, data)
 
     def keeping(self, size: int) -> Keeping:
         """Context with a function that stores outcomes, in files of a number of values or of ten seconds."""
@@ -126,8 +127,9 @@ class Checkpoint:
         """Write outcomes by number to a new file."""
         arrays = _Arrays()
         stored = [(number, _plain(outcome, arrays)) for number, outcome in outcomes.items()]
-        file = io.BytesIO()
-        np.savez(file, outcomes=np.array(json.dumps(stored)), data=np.concatenate([np.empty(0), *arrays.pieces]))
+        text = json.dumps({"names": list(arrays.names), "outcomes": stored}).encode()  # a text of numpy has four bytes
+        file = io.BytesIO()  # a character
+        np.savez(file, outcomes=np.frombuffer(text, np.uint8), data=np.concatenate([np.empty(0), *arrays.pieces]))
         write_bytes(self.folder / f"outcomes-{min(outcomes):08d}-{uuid4().hex}.npz", file.getvalue())
 
 
@@ -212,10 +214,11 @@ def _has_failed(outcome: Any) -> bool:
 
 
 class _Arrays:
-    """Arrays that are stored as one."""
+    """Arrays that are stored as one, and the names of their elements."""
 
     def __init__(self) -> None:
         self.pieces: list[Array] = []
+        self.names: dict[tuple[str, ...], int] = {}
         self._size = 0
 
     def add(self, array: Array) -> list[int]:
@@ -224,25 +227,34 @@ class _Arrays:
         begin, self._size = self._size, self._size + array.size
         return [begin, self._size]
 
+    def add_numbers(self, numbers: Mapping[str, float]) -> list[int]:
+        """Index of the names of some numbers, and first and last index of their values."""
+        return [self.names.setdefault(tuple(numbers), len(self.names)), *self.add(np.array(list(numbers.values())))]
+
 
 def _plain(value: Any, arrays: _Arrays) -> object:
-    """Value for JSON, in which arrays, of one axis, are slices of one array."""
+    """Value for JSON, in which arrays, of one axis, and named numbers are slices of one array."""
     if isinstance(value, Mapping):
+        if value and all(type(one) is float for one in value.values()):
+            return {"numbers": arrays.add_numbers(value)}
         return {"of": {name: _plain(one, arrays) for name, one in value.items()}}
     if isinstance(value, tuple):
         return [_plain(one, arrays) for one in value]
     return {"array": arrays.add(value)} if isinstance(value, np.ndarray) else value
 
 
-def _restored(value: Any, data: Array) -> Any:
+def _restored(value: Any, names: list[list[str]], data: Array) -> Any:
     """Value of `_plain`."""
     if isinstance(value, list):
-        return tuple(_restored(one, data) for one in value)
+        return tuple(_restored(one, names, data) for one in value)
     if not isinstance(value, dict):
         return value
     if "array" in value:
         return data[slice(*value["array"])].copy()
-    return {name: _restored(one, data) for name, one in value["of"].items()}
+    if "numbers" in value:
+        which, begin, end = value["numbers"]
+        return dict(zip(names[which], data[begin:end].tolist(), strict=True))
+    return {name: _restored(one, names, data) for name, one in value["of"].items()}
 
 
 def _same(own: object, other: object) -> bool:

@@ -477,7 +477,9 @@ def _swept(
         for plan, values in metrics.items() if not isinstance(metrics, Failed) else ():
             row = rows.setdefault(plan, {})
             for name, value in values.items():
-                row.setdefault(name, np.full(reached.size, np.nan))[i] = value
+                if name not in row:
+                    row[name] = np.full(reached.size, np.nan)
+                row[name][i] = value
     if not rows:  # interrupted before a value was finished
         names = wanted_measures(experiment.measures)
         rows = {plan: {name: np.full(reached.size, np.nan) for name in names} for plan in experiment.plans}

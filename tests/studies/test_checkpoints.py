@@ -276,3 +276,14 @@ def test_an_empty_text_is_no_folder(tmp_path, monkeypatch):
         with pytest.raises(ValueError, match="checkpoint must be a folder, got an empty text"):
             run(lag, "")
     assert not list(tmp_path.iterdir())
+
+
+def test_values_are_stored_without_a_copy_of_the_names_for_each(tmp_path):
+    """A number has eight bytes, so that names for each value would be several times as long."""
+    rates = np.linspace(0.5, 3.5, 120)
+    found = swept(lag, tmp_path, rates)
+    (file,) = tmp_path.glob("outcomes-*.npz")
+    numbers = sum(row.size for rows in found.metrics.values() for row in rows.values())
+    values = rates.size * len(PLANS)
+    assert file.stat().st_size <= 8 * numbers + 100 * values + 4000
+    same(found, swept(lag, tmp_path, rates))
