@@ -24,12 +24,16 @@ def bars_over_plans(shown: bool) -> Iterator[None]:
 @contextmanager
 def bar(count: int, label: str, progress: bool) -> Iterator[Callable[[], object]]:
     """Bar over runs, within which those of single plans have none."""
-    shown = tqdm(total=count, desc=label, disable=not progress, leave=False)
-    try:
-        with bars_over_plans(False):
+    with bars_over_plans(False):
+        if not progress:  # a disabled bar would still import multiprocessing for its lock
+            yield _nothing
+            return
+        with tqdm(total=count, desc=label, leave=False) as shown:
             yield shown.update
-    finally:
-        shown.close()
+
+
+def _nothing() -> None:
+    """Count a run without a bar."""
 
 
 def each_plan(names: Sequence[str]) -> Iterator[str]:

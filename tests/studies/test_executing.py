@@ -1,5 +1,6 @@
 """Sweeps on executors: taken as they complete, kept when interrupted or bereft of a worker, never run twice."""
 
+import contextlib
 import pickle
 import sys
 import threading
@@ -38,9 +39,9 @@ def drawn(tau=1.0, **names):
     )
 
 
-def swept(build, values=RATES, executor=None, **options):
+def swept(build, values=RATES, executor=None, progress=False, **options):
     return cp.sweep(
-        build, values, PLANS, TIMES, executor=executor, progress=False, measures=["settling_time"], **options
+        build, values, PLANS, TIMES, executor=executor, progress=progress, measures=["settling_time"], **options
     )
 
 
@@ -520,8 +521,9 @@ def test_an_interruption_between_two_results_loses_none(build, k, monkeypatch):
     """As in the progress bar: what is measured together with the last one is ready too."""
     from ctrlplan.studies import progress
 
-    class Bar:
+    class Bar(contextlib.nullcontext):
         def __init__(self, **settings):
+            super().__init__(self)
             self.done = 0
 
         def update(self):
@@ -529,12 +531,9 @@ def test_an_interruption_between_two_results_loses_none(build, k, monkeypatch):
             if self.done == k:
                 raise KeyboardInterrupt
 
-        def close(self):
-            pass
-
     monkeypatch.setattr(progress, "tqdm", Bar)
     with pytest.warns(UserWarning, match="interrupted"):
-        found = swept(build)
+        found = swept(build, progress=True)
     assert found.interrupted
     check(found, RATES[: {1: 1, 2: 5, 5: 5}[k] if build is lag else k])  # one alone, then four together
 
