@@ -163,6 +163,15 @@ def test_a_damaged_file_is_an_error(tmp_path):
         swept(lag, tmp_path)
 
 
+def test_a_file_of_another_layout_is_an_error(tmp_path):
+    """As one of a version that stored a text of numpy."""
+    swept(lag, tmp_path)
+    (file,) = tmp_path.glob("outcomes-*.npz")
+    np.savez(file, outcomes=np.array("[]"), data=np.empty(0))
+    with pytest.raises(ValueError, match=r"checkpoint must have complete files, got .*outcomes-.*; delete it"):
+        swept(lag, tmp_path)
+
+
 def test_the_version_is_part_of_the_study(tmp_path):
     swept(lag, tmp_path)
     path = tmp_path / "study.json"
