@@ -84,8 +84,8 @@ _GOAL = "goal"
 _SIDES = {_GOAL: (-6.0, "right")}
 """Offset to the right [pt] and alignment of a name where they are not those of the others."""
 
-_BELOW = 14.0
-"""Height above the lower edge [pt] from which on a point has its name below."""
+_LOW = 14.0
+"""Height [pt] of a point over the lower edge up to which its name is above it."""
 
 
 def mark_waypoints(axes: Axes, comparison: Comparison, outputs: tuple[str, str]) -> None:
@@ -98,7 +98,7 @@ def mark_waypoints(axes: Axes, comparison: Comparison, outputs: tuple[str, str])
     for text, place in named.items():
         height = points * (place[1] - bottom) / (top - bottom)
         across, side = _SIDES.get(text, (6.0, "left"))
-        offset = (across, -10.0 if height > _BELOW else 5.0)
+        offset = (across, -10.0 if height > _LOW else 5.0)
         axes.annotate(text, place, xytext=offset, textcoords="offset points", ha=side, fontsize=font_size(9))
 
 

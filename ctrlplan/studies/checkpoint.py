@@ -127,8 +127,9 @@ class Checkpoint:
         """Write outcomes by number to a new file."""
         arrays = _Arrays()
         stored = [(number, _plain(outcome, arrays)) for number, outcome in outcomes.items()]
-        text = json.dumps({"names": list(arrays.names), "outcomes": stored}).encode()  # a text of numpy has four bytes
-        file = io.BytesIO()  # a character
+        # As bytes: a text of numpy has four of them for each character.
+        text = json.dumps({"names": list(arrays.names), "outcomes": stored}).encode()
+        file = io.BytesIO()
         np.savez(file, outcomes=np.frombuffer(text, np.uint8), data=np.concatenate([np.empty(0), *arrays.pieces]))
         write_bytes(self.folder / f"outcomes-{min(outcomes):08d}-{uuid4().hex}.npz", file.getvalue())
 
