@@ -47,7 +47,7 @@ class Grid:
     def __init__(self, t: Array) -> None:
         self.t = t
         self.step, self.width, self.span = t[1:] - t[:-1], t[2:] - t[:-2], t[3:] - t[:-3]
-        self.pace, self.narrow = 1.0 / self.step, 1.0 / self.width
+        self.pace, self.narrow, self.spread = 1.0 / self.step, 1.0 / self.width, 1.0 / self.span
         self.quarter = self.step[1:-1] ** 2 / 4  # of the larger curvature: bound on the distance from the chord
         self.starts = np.arange(0, t.size, STRETCH)
         # Of four samples in a range of 1: both curvatures are at most 1 / (product of the adjacent steps).
