@@ -42,8 +42,8 @@ def _smooth(grid: Grid, f: Array, signed: bool) -> NDArray[np.bool_]:
     reach = smaller + size if signed else None
     smaller *= CURVATURES
     smooth = (size <= smaller) & grid.formed
-    inflected = np.flatnonzero(~smooth & grid.formed)
-    smooth.ravel()[inflected] = _uncut(grid, change, *np.divmod(inflected, smooth.shape[1]))
+    rest = np.flatnonzero(~smooth & grid.formed)
+    smooth.ravel()[rest] = _uncut(grid, slope, *np.divmod(rest, smooth.shape[1]))
     if reach is not None:
         reach *= grid.quarter
         size, negative = np.abs(f), f < 0
@@ -56,12 +56,11 @@ def _smooth(grid: Grid, f: Array, signed: bool) -> NDArray[np.bool_]:
 def _uncut(grid: Grid, change: Array, rows: NDArray[np.intp], i: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Return whether the cubics of some inner intervals, as about an inflection point, are those of a smooth curvature.
 
-    `change` (nrows, m) are the differences of the curvatures. The third difference of such an interval needs no limit.
+    Their third differences need no limit. `change` (nrows, m + 2) are the differences of the curvatures, then others.
     """
-    last = change.shape[1] - 1
-    near = np.clip(i + np.arange(-1, 2)[:, None], 0, last)
-    before, third, after = change[rows, near] * grid.spread.take(near)
-    return (limited(third, before, after) == third) & (i > 0) & (i < last)
+    near = np.arange(-1, 2)[:, None] + i
+    before, third, after = change.take(near + rows * change.shape[1], mode="clip") * grid.spread.take(near, mode="clip")
+    return (limited(third, before, after) == third) & (i > 0) & (i < grid.spread.size - 1)
 
 
 def areas(grid: Grid, f: Array, places: Places, p: Pieces) -> Array:
