@@ -133,7 +133,7 @@ class Path:
     path: Array
     points: Array
 
-    @property
+    @cached_property
     def steps(self) -> bool:
         """Whether the position is discontinuous, so that there is no path."""
         return bool(self.plan.jumps(0))
