@@ -154,7 +154,7 @@ class Evaluation:
             np.concatenate([np.where(never, np.nan, edges), np.where(np.isfinite(top), top, np.nan)]),
             np.concatenate([first, np.zeros_like(others)]),
         )
-        number, k = search(grid, f, limits, sought)
+        number, k = search(grid, f, limits, sought) if sought.rows.size else (sought.rows, sought.rows)
         places = [(sought.rows[number], k)]
         for (kind, start), part in self._integrals.items():
             row, at = rough(grid, f[part], finite[part], kind is areas)

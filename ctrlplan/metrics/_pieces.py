@@ -205,12 +205,16 @@ def cubics_of_rows(grid: Grid, f: Array, rows: NDArray[np.intp], chosen: NDArray
         whole, shape = cubics(grid.t, f), (len(f), ntime - 1)
         return Pieces(*(np.broadcast_to(array, shape)[rows, chosen] for array in vars(whole).values()))
     deep = (chosen >= 2) & (chosen <= ntime - 4)
+    if deep.all():
+        return _inner_cubics(grid, f, rows, chosen)
     inside, outside = np.flatnonzero(deep), np.flatnonzero(~deep)
     # A cubic depends on the samples up to four intervals away.
     k, width = chosen[outside], min(ntime, 10)
     first = np.clip(k - 4, 0, ntime - width)
     window = first[:, None] + np.arange(width)
     outer = cubics(grid.t[window], f[rows[outside, None], window])[np.arange(k.size), k - first]
+    if not inside.size:
+        return outer
     inner = _inner_cubics(grid, f, rows[inside], chosen[inside])
     place = np.empty_like(chosen)
     place[inside], place[outside] = np.arange(inside.size), np.arange(inside.size, chosen.size)
