@@ -166,6 +166,7 @@ class Compiled:
         self._steps: Lru[tuple[int, int, bool, bool], OneStep | None] = Lru(_CACHE_SIZE)
         self._equations: dict[tuple[int, bool, bool], dict[str, ca.SX]] = {}
         self._functions_of_segments: dict[tuple[int, bool, bool], ca.Function] = {}
+        self._derived: Lru[tuple[int, int, bool, bool], dict[str, ca.Function]] = Lru(_CACHE_SIZE)
 
     def __getstate__(self) -> dict[str, object]:
         """State without what can be rebuilt."""
@@ -289,14 +290,19 @@ class Compiled:
             "show_eval_warnings": False,
             "disable_internal_warnings": True,
         }
-        grid = np.frombuffer(settings.grid).tolist()
+        what, grid = settings[:3], np.frombuffer(settings.grid).tolist()
+        # CasADi derives the Jacobian for each integrator, unless it is given those functions of another one.
+        derived = self._derived.get((threading.get_ident(), *what), dict)
         with passing_interruptions():
-            equations = self._function_of_segments(settings.width, settings.harmonic, settings.scaled)
-            made = ca.integrator("segment", "cvodes", equations, 0.0, grid, options)
+            equations = self._function_of_segments(*what)
+            made = ca.integrator("segment", "cvodes", equations, 0.0, grid, {**options, "cache": derived})
+            if not derived:
+                named = {name: made.get_function(name) for name in made.get_function()}
+                derived |= {name: function for name, function in named.items() if function.name() == name}
         return Segment(made, self.moving.size)
 
     def _function_of_segments(self, width: int, harmonic: bool, scaled: bool) -> ca.Function:
-        """The equations of a segment as a function, whose derivatives CasADi keeps for all integrators."""
+        """The equations of a segment as a function."""
         key = width, harmonic, scaled
         if key not in self._functions_of_segments:
             equations = self._segment_equations(width, harmonic, scaled)
