@@ -213,6 +213,45 @@ def test_the_first_of_several_stops_counts(method):
     assert abs(found.time[-1] + math.log(0.7)) <= ALLOWED[method]
 
 
+def pulse_at_two(rates):
+    """A state with given rates from 0, and a narrow pulse of it at 2: above 0.5 for a few samples."""
+    return ct.nlsys(
+        rates,
+        lambda t, x, u, p: np.exp(-(((x[0] - 2.0) / 0.01) ** 2)),
+        inputs=0,
+        outputs=["y"],
+        states=["x"],
+        name="pulse",
+    )
+
+
+@pytest.mark.parametrize("method", ["compiled", "python"])
+@pytest.mark.parametrize("end", [2.05, 10.0])
+def test_a_run_ends_in_a_short_pulse(method, end):
+    times = np.linspace(0.0, end, 1001)
+    stop = Event("y", high=0.5, stop=True)
+    found = cp.simulate(pulse_at_two(lambda t, x, u, p: [1.0]), times, method=method, events=[stop])
+    exact = 2.0 - 0.01 * math.sqrt(math.log(2.0))
+    assert [o.stop for o in found.events] == [True]
+    assert abs(found.time[-1] - exact) <= 1e-9
+    assert np.abs(found.states[0] - found.time).max() <= 1e-9
+    assert np.array_equal(found.time[:-1], times[times < exact])
+
+
+@pytest.mark.parametrize("method", ["compiled", pytest.param("python", marks=pytest.mark.slow)])
+def test_a_run_ends_in_a_short_pulse_before_its_solution_does(method):
+    def rates(t, x, u, p):
+        return [1.0 / np.sqrt(3.0 - x[0])]  # (3 - x)^(3/2) = 3^(3/2) - 1.5 t
+
+    times = np.linspace(0.0, 11.0, 2001)
+    stop = Event("y", high=0.5, stop=True)
+    with np.errstate(all="ignore"):
+        found = cp.simulate(pulse_at_two(rates), times, method=method, events=[stop])
+    level = 1.0 + 0.01 * math.sqrt(math.log(2.0))
+    assert abs(found.time[-1] - (3.0**1.5 - level**1.5) / 1.5) <= 1e-8
+    assert [o.stop for o in found.events] == [True]
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_a_stop_that_is_not_reached_changes_nothing(method):
     plain = cp.simulate(LAG, T, 1.0, method=method)
