@@ -433,12 +433,12 @@ class Attempt(Generic[S]):
         found: Array = self.solver.advance(self.run.series(start), start, np.array([t]), self.run.states[:, k])
         return found[:, -1]
 
-    def within(self, series: Series, times: Array, states: Array) -> int | None:
-        """Index of the first time of a segment by which an event that ends the run has occurred; it may be missed."""
+    def within(self, series: Series, times: Array, states: Array) -> bool:
+        """Whether an event that ends the run has occurred at a few of the times of a segment."""
         some = slice((times.size - 1) % _SOME, None, _SOME)
         t, known = times[some], series.at(times[some])
         seen = _seen(self.solver, t, states[:, some], known[: self.job.prepared.ninputs], lambda: known)
-        return None if self._stop_of(seen) is None else self._stop_of(self._new_snapshot(times, states))
+        return self._stop_of(seen) is not None
 
     def first(self, run: NetworkRun) -> int | None:
         """Index of the first time of a run by which an event that ends it has occurred."""

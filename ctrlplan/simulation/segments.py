@@ -116,16 +116,8 @@ class NetworkRun:
 class Stops(Protocol):
     """Events that may end a run."""
 
-    def within(self, series: Series, times: Array, states: Array) -> int | None:
-        """Index of the first time of a segment by which one has occurred; evaluated at a few times, it may be missed.
-
-        Parameters
-        ----------
-        series : Series
-            Functions of time over the segment.
-        times, states : ndarray
-            From the start of the segment to its end.
-        """
+    def within(self, series: Series, times: Array, states: Array) -> bool:
+        """Whether one has occurred at a few of the times of a segment, with its functions of time."""
 
     def first(self, run: NetworkRun) -> int | None:
         """Index of the first time of a run by which one has occurred, after its start; evaluated at all times."""
@@ -200,10 +192,8 @@ def integrate(
         try:
             states = _advanced(solver, series, left, grid, x, last)
         except SolverError:
-            so_far = found.run(left, x)
-            stop = None if stops is None or left == first else stops.first(so_far)
-            if stop is not None:
-                return so_far.until(stop)
+            if ended := _ended(found.run(left, x), stops):
+                return ended
             if right - left < shortest:
                 raise
             reach = 0.5 * (right - left)
@@ -213,15 +203,12 @@ def integrate(
             continue
         schedule.add(memory.jumps)
         found.add(series, left, x, grid[requested], states[:, requested])
-        before, x = x, states[:, -1]
+        x = states[:, -1]
         if ends or right < last:
             x = schedule.sample(equations, right, x)
-        if stops is not None:
-            grid, states = np.append(left, grid), np.column_stack([before, states])
-            stop = stops.within(series, grid, states)
-            if stop is not None:
-                return found.run(float(grid[stop]), states[:, stop] if stop < grid.size - 1 else x)
         left, reach = right, min(longest, 2.0 * reach)
+        if stops is not None and stops.within(series, grid, states) and (ended := _ended(found.run(left, x), stops)):
+            return ended
     return found.run(left, x)
 
 
@@ -342,6 +329,12 @@ def _reached(times: Array, left: float, reach: float) -> float:
     """
     before = float(times[np.searchsorted(times, left + reach * (1.0 + 1e-9), side="right") - 1])
     return before if before > left + 0.5 * reach else left + reach
+
+
+def _ended(run: NetworkRun, stops: Stops | None) -> NetworkRun | None:
+    """A run up to the first event that ends it; None if there is none."""
+    stop = None if stops is None or run.times.size == 1 else stops.first(run)
+    return None if stop is None else run.until(stop)
 
 
 def _advanced(solver: Solver, series: Series, left: float, grid: Array, state: Array, last: float) -> Array:
