@@ -11,7 +11,8 @@ from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan.simulation import Event, Occurrence
-from ctrlplan.simulation.events import Watched, crossings
+from ctrlplan.simulation.events import Departures, Watched, crossings
+from ctrlplan.simulation.response import departures_in
 from ctrlplan.simulation.simulate import simulate_for_metrics
 
 METHODS = ("exact", "compiled", "python")
@@ -429,6 +430,17 @@ def limited():
     return ct.interconnect([gain, limits, plant], inputs="r", outputs=["y", "u"], name="limited")
 
 
+def test_departures_are_counted_and_the_first_is_located():
+    """y = sin t, v = cos t: v is above 0.9 at the start."""
+    events = [Event("y", low=-0.5, high=0.5), Event("v", high=0.9, name="far"), Event("y", high=0.99, name="far")]
+    later = simulate_for_metrics(OSCILLATOR, T, None, [0.0, 1.0], events=events)[0]
+    found = departures_in(later)
+    assert [(one.name, one.number) for one in found] == [("far", 4), ("y", 4)]
+    assert np.abs([found[0].first, found[1].first - math.pi / 6]).max() <= 1e-11
+    assert found == Departures.of(later.events)
+    assert departures_in(cp.simulate(OSCILLATOR, T, None, [0.5, 0.0], events=[Event("y", high=0.6)])) == []
+
+
 @pytest.mark.parametrize("stop", [False, True])
 def test_events_read_later_are_those_of_simulate(stop):
     events = [Event("y", high=0.9, stop=stop), Event("y", low=0.25, high=0.75)]
@@ -444,6 +456,16 @@ def test_events_read_later_are_those_of_simulate(stop):
     assert end is None or (end.stop and later.time[-1] == end.time)
     assert np.array_equal(later.time, now.time)
     assert np.array_equal(later.outputs, now.outputs)
+
+
+@pytest.mark.parametrize("stop", [False, True])
+def test_departures_of_events_that_are_not_located_are_those_of_simulate(stop):
+    events = [Event("y", high=0.9, stop=stop), Event("y", low=0.25, high=0.75)]
+    later = departures_in(simulate_for_metrics(limited(), T, 1.0, events=events)[0])
+    every = Departures.of(cp.simulate(limited(), T, 1.0, events=events).events)
+    assert [one[:2] for one in later] == [one[:2] for one in every]
+    assert np.abs(np.subtract([one.first for one in later], [one.first for one in every])).max() <= 1e-9
+    assert max(one.number for one in later) > 1
 
 
 def test_functions_of_the_user_are_not_called_later():
@@ -472,7 +494,8 @@ def watched(value):
         return float(value(t))
 
     entry = Watched("s", lambda snapshot: snapshot.t, -math.inf, 0.0)
-    return crossings(entry, times, np.array([float(value(t)) for t in times]), at), len(seen)
+    found = list(crossings(entry, times, np.array([float(value(t)) for t in times]), at))
+    return found, len(seen)
 
 
 @pytest.mark.parametrize(
