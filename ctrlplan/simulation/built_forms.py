@@ -16,9 +16,13 @@ from ctrlplan.symbolic.fingerprint import value_token
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled
+    from ctrlplan.symbolic.tracing import Trace
 
 _CACHE_SIZE = 8
 """Maximum number of compiled forms of a system."""
+
+_TRACES = 64
+"""Maximum number of traces of blocks that a context of `shared_forms` keeps."""
 
 
 class NotApplicableError(ValueError):
@@ -67,7 +71,8 @@ def shared_forms() -> Iterator[None]:
     """Compile loops with equal blocks and connections once in a context, as those of several plans.
 
     A loop that differs in its sources and in the times, states and parameters of
-    its runs has the same equations. If a run of them has to be repeated with closer
+    its runs has the same equations. Equal blocks of different loops, as the plant
+    under several laws, are traced once. If a run of them has to be repeated with closer
     tolerances, later ones begin with these. Contexts inside another one share its forms.
     """
     if _SHARED.get() is not None:
@@ -87,12 +92,15 @@ class _Shared:
     ----------
     forms : Lru
         Compiled forms by structure.
+    traces : Lru
+        Traces of blocks by structure.
     close : set of (Compiled, float)
         Forms and relative tolerances of runs that were repeated with closer states.
     """
 
     def __init__(self) -> None:
         self.forms: Lru[tuple[object, ...], BuiltForm] = Lru(_CACHE_SIZE)
+        self.traces: Lru[tuple[object, ...], Trace] = Lru(_TRACES)
         self.close: set[tuple[Compiled, float]] = set()
 
 
@@ -122,6 +130,13 @@ def built_once(structure: Callable[[], tuple[object, ...] | None], build: Callab
         return shared.forms.get(key, lambda: _compiled(build()))
     except _NotBuiltError as error:
         return error.form
+
+
+def traced_once(structure: Callable[[], tuple[object, ...] | None], trace: Callable[[], Trace]) -> Trace:
+    """Trace of a block of a structure, made once in a context of `shared_forms`; every time for the structure None."""
+    shared = _SHARED.get()
+    key = None if shared is None else structure()
+    return trace() if shared is None or key is None else shared.traces.get(key, trace)
 
 
 class _NotBuiltError(Exception):
@@ -174,6 +189,7 @@ class BuiltForms:
         shared = _SHARED.get()
         if shared is not None:
             shared.forms.clear()
+            shared.traces.clear()
         with BUILDING:
             retained = []
             for entry in self.forms:

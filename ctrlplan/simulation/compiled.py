@@ -148,12 +148,15 @@ class Compiled:
         w = _signals(network, traces, own, steps, t, x, d)
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
         self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(_sparse(network.read) @ w)])
-        self._functions["switches"] = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]))
+        whole = ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)])
+        self._functions["switches"] = switches = switch_arguments(whole)
         self.nswitches = self._functions["switches"].numel_out(0)
         self.compared = Compared(self.nswitches)
-        jumps = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]), bends=False)
-        self._timed = [self._of_time("switches", self._functions["switches"], network, 0)]
-        self._timed += [self._of_time("jumps", jumps, network, 2)]
+        self._timed: list[str] = []
+        self._add_timed("switches", switches, _switch_with(switches, network, 0))
+        if _switch_with(switches, network, 2).any():
+            jumps = switch_arguments(whole, bends=False)
+            self._add_timed("jumps", jumps, _switch_with(jumps, network, 2))
         self.depends_on_time = any(
             trace is not None and block.changes_unseen and trace.depends_on_time()
             for block, trace in zip(network.blocks, traces, strict=True)
@@ -166,6 +169,7 @@ class Compiled:
         self._steps: Lru[tuple[int, int, bool, bool], OneStep | None] = Lru(_CACHE_SIZE)
         self._equations: dict[tuple[int, bool, bool], dict[str, ca.SX]] = {}
         self._functions_of_segments: dict[tuple[int, bool, bool], ca.Function] = {}
+        self._derived: Lru[tuple[int, int, bool, bool], dict[str, ca.Function]] = Lru(_CACHE_SIZE)
 
     def __getstate__(self) -> dict[str, object]:
         """State without what can be rebuilt."""
@@ -204,33 +208,22 @@ class Compiled:
             Parameters of the run.
         """
         found: list[float] = []
-        for name, function in self._timed:
-            if function is not None:
+        for name in self._timed:
 
-                def sides(t: Array, name: str = name) -> Array:
-                    return np.sign(
-                        self._at_many(name, t, np.zeros((self._rates.numel_in(1), t.size)), time_values(t), p)
-                    )
+            def sides(t: Array, name: str = name) -> Array:
+                return np.sign(self._at_many(name, t, np.zeros((self._rates.numel_in(1), t.size)), time_values(t), p))
 
-                found += changes_of_side(sides, first, last)
+            found += changes_of_side(sides, first, last)
         return sorted(set(found))
 
-    def _of_time(
-        self, name: str, switches: ca.Function, network: Network, argument: int
-    ) -> tuple[str, ca.Function | None]:
-        """Switches that depend on time (argument 0) or functions of time (2) but on no state; None if there is none."""
-        delayed = np.zeros(network.nsignals, dtype=bool)
-        for i in network.blocks_with("delay"):
-            delayed[network.outputs[i]] = True
-        depends = {k: np.asarray(ca.DM(switches.jac_sparsity(0, k)).full(), dtype=bool) for k in (0, 1, 2)}
-        undecided = depends[1].any(axis=1) | depends[2][:, delayed[network.time_rows]].any(axis=1)
-        rows = depends[argument].any(axis=1) & ~undecided
-        if not rows.any():
-            return name, None
-        inputs = [ca.SX.sym(switches.name_in(k), switches.sparsity_in(k)) for k in range(switches.n_in())]
-        chosen = switches(*inputs)[np.flatnonzero(rows).tolist()]
-        self._functions[f"timed {name}"] = ca.Function("timed", inputs, [ca.densify(chosen)])
-        return f"timed {name}", self._functions[f"timed {name}"]
+    def _add_timed(self, name: str, switches: ca.Function, rows: NDArray[np.bool_]) -> None:
+        """Function of some switches, if there are any, for `instants`."""
+        if rows.any():
+            inputs = [ca.SX.sym(switches.name_in(k), switches.sparsity_in(k)) for k in range(switches.n_in())]
+            chosen = switches(*inputs)[np.flatnonzero(rows).tolist()]
+            function = ca.Function("timed", inputs, [ca.densify(chosen)])
+            self._functions[f"timed {name}"] = function
+            self._timed.append(f"timed {name}")
 
     def sides(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         """Signs of the switching functions at many times, (nswitches, ntime)."""
@@ -289,14 +282,19 @@ class Compiled:
             "show_eval_warnings": False,
             "disable_internal_warnings": True,
         }
-        grid = np.frombuffer(settings.grid).tolist()
+        what, grid = settings[:3], np.frombuffer(settings.grid).tolist()
+        # CasADi derives the Jacobian for each integrator, unless it is given those functions of another one.
+        derived = self._derived.get((threading.get_ident(), *what), dict)
         with passing_interruptions():
-            equations = self._function_of_segments(settings.width, settings.harmonic, settings.scaled)
-            made = ca.integrator("segment", "cvodes", equations, 0.0, grid, options)
+            equations = self._function_of_segments(*what)
+            made = ca.integrator("segment", "cvodes", equations, 0.0, grid, {**options, "cache": derived})
+            if not derived:
+                named = {name: made.get_function(name) for name in made.get_function()}
+                derived |= {name: function for name, function in named.items() if function.name() == name}
         return Segment(made, self.moving.size)
 
     def _function_of_segments(self, width: int, harmonic: bool, scaled: bool) -> ca.Function:
-        """The equations of a segment as a function, whose derivatives CasADi keeps for all integrators."""
+        """The equations of a segment as a function."""
         key = width, harmonic, scaled
         if key not in self._functions_of_segments:
             equations = self._segment_equations(width, harmonic, scaled)
@@ -691,6 +689,16 @@ def _resolved(left: float, grid: Array) -> int:
         return grid.size
     close = np.minimum.accumulate(gaps) < _CLOSEST * (grid - left)
     return max(1, int(close.argmax()))
+
+
+def _switch_with(switches: ca.Function, network: Network, argument: int) -> NDArray[np.bool_]:
+    """Which switches depend on time (argument 0) or functions of time (2) but on no state."""
+    delayed = np.zeros(network.nsignals, dtype=bool)
+    for i in network.blocks_with("delay"):
+        delayed[network.outputs[i]] = True
+    depends = {k: np.asarray(ca.DM(switches.jac_sparsity(0, k)).full(), dtype=bool) for k in {argument, 1, 2}}
+    undecided = depends[1].any(axis=1) | depends[2][:, delayed[network.time_rows]].any(axis=1)
+    return np.asarray(depends[argument].any(axis=1) & ~undecided)
 
 
 def _feedthrough(block: Block, trace: Trace | None) -> NDArray[np.bool_]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,6 +121,43 @@ def what_happened(name: str) -> str:
     return f"{name} left its limits"
 
 
+class Departures(NamedTuple):
+    """Crossings by which signals left their limits: name of the event, their number, and the first time [s]."""
+
+    name: str
+    number: int
+    first: float
+
+    @classmethod
+    def of(cls, events: Iterable[Occurrence]) -> list[Departures]:
+        """Those of located events, in order of the first time."""
+        return cls.by_name(cls(event.name, 1, event.time) for event in events if event.kind != "inside")
+
+    @classmethod
+    def by_name(cls, found: Iterable[Departures]) -> list[Departures]:
+        """Those of one name together, in order of the first time."""
+        groups = dict[str, list[Departures]]()
+        for one in found:
+            groups.setdefault(one.name, []).append(one)
+        total = [
+            cls(name, sum(one.number for one in group), min(one.first for one in group))
+            for name, group in groups.items()
+        ]
+        return sorted(total, key=lambda one: one.first)
+
+
+class LaterEvents(ABC):
+    """Events of a run that are located when they are required."""
+
+    @abstractmethod
+    def __call__(self) -> list[Occurrence]:
+        """All crossings up to the end of the run, in order of time."""
+
+    @abstractmethod
+    def departures(self) -> list[Departures]:
+        """Crossings by which signals left their limits, of each event; only the first is located."""
+
+
 @dataclass(frozen=True, eq=False)
 class Snapshot:
     """Times, states and inputs of a run, time last; its outputs, and all signals of a network, on demand."""
@@ -174,8 +212,8 @@ class Watched:
 
 def crossings(
     watched: Watched, times: Array, values: Array, value_at: Callable[[int, float], float]
-) -> list[Occurrence]:
-    """Crossings of limits in a record, located by root finding.
+) -> Iterator[Occurrence]:
+    """Crossings of limits in a record, in order of time, each located by root finding when it is required.
 
     Parameters
     ----------
@@ -187,14 +225,16 @@ def crossings(
         Maps k and a time between times[k] and times[k + 1] to the signal.
     """
     sides = watched.side(values)
-    found = [Occurrence(float(times[0]), watched.name, _KINDS[int(sides[0])], watched.stop)] if sides[0] else []
+    if sides[0]:
+        yield Occurrence(float(times[0]), watched.name, _KINDS[int(sides[0])], watched.stop)
+    time = -math.inf
     for k in np.flatnonzero(np.diff(sides)).tolist():
         before, after = int(sides[k]), int(sides[k + 1])
         # Between below and above, both limits are crossed.
         stages = [(before, 0), (0, after)] if before * after < 0 else [(before, after)]
         for left, right in stages:
             level = watched.limit(left, right)
-            time = _root(
+            root = _root(
                 partial(_beyond, value_at, k, level),
                 float(times[k]),
                 float(times[k + 1]),
@@ -202,10 +242,22 @@ def crossings(
                 float(values[k + 1]) - level,
                 _expected(times, values, k, level),
             )
-            if left != before:  # both limits within a rounding error of time
-                time = max(time, found[-1].time)
-            found.append(Occurrence(time, watched.name, _KINDS[right], watched.stop and right != 0))
-    return found
+            # Both limits may be within a rounding error of time.
+            time = root if left == before else max(root, time)
+            yield Occurrence(time, watched.name, _KINDS[right], watched.stop and right != 0)
+
+
+def departures_of(
+    watched: Watched, times: Array, values: Array, value_at: Callable[[int, float], float]
+) -> list[Departures]:
+    """Number and first of the crossings by which a signal left its limits, the only one located; empty without any.
+
+    Arguments are those of `crossings`.
+    """
+    sides = watched.side(values)
+    count = int(sides[0] != 0) + int(np.count_nonzero((sides[1:] != sides[:-1]) & (sides[1:] != 0)))
+    # The first crossing is one of them: the start, if the signal is outside there.
+    return [Departures(watched.name, count, next(crossings(watched, times, values, value_at)).time)] if count else []
 
 
 def watched_events(events: Sequence[Event], labels: Mapping[str, tuple[str, int]]) -> list[Watched]:

@@ -31,7 +31,7 @@ from ctrlplan.simulation.scales import (
 )
 from ctrlplan.simulation.segment_lengths import warn_of_short_delays
 from ctrlplan.simulation.segments import NetworkRun, Solver, integrate, known_before
-from ctrlplan.simulation.signals import TimeSignals, breakpoints_of
+from ctrlplan.simulation.signals import Series, TimeSignals, breakpoints_of
 from ctrlplan.symbolic.isolation import untouched
 
 VISITED = 12
@@ -53,6 +53,9 @@ _TIGHT, _COSTLY = 1e2, 10.0
 """Reduction of tolerances after which evaluations are counted, and the factor of their number that ends it: a method
 of order 5 makes 2.5 times as many, and a hundred times where it resolves rounding errors of the equations.
 """
+
+_SOME = 16
+"""Every such time of a segment is searched for an event that ends the run, and all times after the run."""
 
 _UNCERTAIN = 1e-6
 """Uncertainty of an output, relative to its range, above which it is reported in the response."""
@@ -245,6 +248,7 @@ class Attempt(Generic[S]):
     solver: S = field(init=False)
     run: NetworkRun = field(init=False)
     _last: tuple[Array, Array] | None = field(init=False, default=None)
+    _whole: Snapshot | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         job = self.job
@@ -268,7 +272,7 @@ class Attempt(Generic[S]):
         marks = self.solver.instants(job.first, float(job.times[-1]), lambda t: known_before(self.time_signals, t))
         self.solver.switches = sorted([*job.blocks.breakpoints, *marks])
         by_python = job.blocks.blocks_with("period") or job.blocks.blocks_with("delay")
-        self.run = integrate(
+        run = integrate(
             job.blocks,
             self.equations if by_python else None,
             self.solver,
@@ -277,8 +281,9 @@ class Attempt(Generic[S]):
             job.state,
             resolution=10.0 * job.rtol,
             marks=marks,
-            stops_after=self._stops_after if self.stops else None,
+            stops=self if self.stops else None,
         )
+        self.run = self._ended(run) if self.stops else run
         self.method.check(self)
 
     def loose(self) -> NDArray[np.bool_]:
@@ -399,6 +404,10 @@ class Attempt(Generic[S]):
         return self._last[1]
 
     def _snapshot(self, t: Array, x: Array) -> Snapshot:
+        known = self._whole
+        return known if known is not None and t is known.t and x is known.x else self._new_snapshot(t, x)
+
+    def _new_snapshot(self, t: Array, x: Array) -> Snapshot:
         ninputs = self.job.prepared.ninputs
         if not ninputs:
             return _seen(self.solver, t, x, np.zeros((0, t.size)), partial(self.time_values, t))
@@ -424,9 +433,28 @@ class Attempt(Generic[S]):
         found: Array = self.solver.advance(self.run.series(start), start, np.array([t]), self.run.states[:, k])
         return found[:, -1]
 
-    def _stops_after(self, t: Array, x: Array) -> int | None:
-        """Index of the first time, after the start of a segment, by which an event that ends the run has occurred."""
-        seen = self._snapshot(t, x)
+    def within(self, series: Series, times: Array, states: Array) -> bool:
+        """Whether an event that ends the run has occurred at a few of the times of a segment."""
+        some = slice((times.size - 1) % _SOME, None, _SOME)
+        t, known = times[some], series.at(times[some])
+        seen = _seen(self.solver, t, states[:, some], known[: self.job.prepared.ninputs], lambda: known)
+        return self._stop_of(seen) is not None
+
+    def first(self, run: NetworkRun) -> int | None:
+        """Index of the first time of a run by which an event that ends it has occurred."""
+        return self._stop_of(self._new_snapshot(run.times, run.states))
+
+    def _ended(self, run: NetworkRun) -> NetworkRun:
+        """The run up to the first event that ends it; its snapshot is kept."""
+        seen = self._new_snapshot(run.times, run.states)
+        stop = self._stop_of(seen)
+        if stop is not None and stop < run.times.size - 1:
+            return run.until(stop)
+        self._whole = seen
+        return run
+
+    def _stop_of(self, seen: Snapshot) -> int | None:
+        """Index of the first time, after that of the start, by which an event that ends a run has occurred."""
         beyond = np.any([entry.side(entry.value(seen)) != 0 for entry in self.watched if entry.stop], axis=0)
         return max(1, int(beyond.argmax())) if beyond.any() else None
 

@@ -22,6 +22,7 @@ from ctrlplan.simulation.built_forms import (
     DisagreementError,
     NotCompiledError,
     built_once,
+    traced_once,
 )
 from ctrlplan.simulation.delayed_signals import DelayedSignal, HeldDelaySignal
 from ctrlplan.simulation.interpreted import Interpreted
@@ -317,7 +318,9 @@ class Prepared(Displayed):
                 if block.linear or block.is_time_function:
                     traces.append(None)
                     continue
-                trace = traced(block, params, first, state[states], fed(w))
+                trace = traced_once(
+                    partial(structure, block, params), partial(traced, block, params, first, state[states], fed(w))
+                )
                 traces.append(trace)
                 # A parameter that is a constant in the trace must have this value in every run of it.
                 constants |= {key: value_token(params[key]) for key in params if key not in trace.symbols}

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ctrlplan._display import ROWS, Displayed, Facts, Part, Table, number, shortened
 from ctrlplan._lru import BUILDING
 from ctrlplan._types import Array
-from ctrlplan.simulation.events import Occurrence
+from ctrlplan.simulation.events import Departures, LaterEvents, Occurrence
 
 if TYPE_CHECKING:
     from ctrlplan.trajectories.export import SampledTable
@@ -183,6 +183,15 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
             yield f"Event at {event}"
         if len(self.events) > ROWS:
             yield f"{len(self.events) - ROWS} more events"
+
+
+def departures_in(response: SimulationResponse) -> list[Departures]:
+    """Crossings by which signals left their limits, of each event; events that are not located yet are only counted."""
+    found = response._events
+    if isinstance(found, LaterEvents):
+        with BUILDING:  # as for the events themselves
+            return found.departures()
+    return Departures.of(response.events)
 
 
 def signal_table(response: ct.TimeResponseData) -> SampledTable:

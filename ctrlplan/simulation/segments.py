@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from bisect import bisect_right, insort
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from fractions import Fraction
@@ -106,6 +106,22 @@ class NetworkRun:
         """Signals that are functions of time, over the segment that contains a time."""
         return self.segments[max(0, bisect_right(self.segments, t, key=lambda segment: segment[0]) - 1)][1]
 
+    def until(self, k: int) -> NetworkRun:
+        """The run up to times[k], k > 0."""
+        end = float(self.times[k])
+        segments = [segment for segment in self.segments if segment[0] < end]
+        return NetworkRun(self.times[: k + 1], self.states[:, : k + 1], segments)
+
+
+class Stops(Protocol):
+    """Events that may end a run."""
+
+    def within(self, series: Series, times: Array, states: Array) -> bool:
+        """Whether one has occurred at a few of the times of a segment, with its functions of time."""
+
+    def first(self, run: NetworkRun) -> int | None:
+        """Index of the first time of a run by which one has occurred, after its start; evaluated at all times."""
+
 
 def integrate(
     network: Network,
@@ -116,7 +132,7 @@ def integrate(
     state: Array,
     resolution: float,
     marks: Sequence[float] = (),
-    stops_after: Callable[[Array, Array], int | None] | None = None,
+    stops: Stops | None = None,
     course: Course | None = None,
 ) -> NetworkRun:
     """Run a network over increasing times.
@@ -135,9 +151,9 @@ def integrate(
         Relative accuracy of the stored signals of delays.
     marks : sequence of float, optional
         Further times [s] at which equations switch.
-    stops_after : callable, optional
-        Maps the times and states of a segment to the index of the time at which
-        the run may end, None for none of them; segments are then shorter.
+    stops : Stops, optional
+        Events that may end the run; segments are then shorter. The run goes on after
+        one that is missed at the few times of a segment, unless the solver fails.
     course : Course, optional
         Former runs that this one continues. Samples that are due at its end
         belong to the next run.
@@ -154,7 +170,7 @@ def integrate(
     else:
         course.prolong(apart([first, *marks, last])[1:-1], first, last)
     memory, schedule, rounding = course.memory, course.schedule, course.rounding
-    shortest, reach, longest = _lengths(network, memory.delays, last - first, stops_after is not None)
+    shortest, reach, longest = _lengths(network, memory.delays, last - first, stops is not None)
     found, span, left = _Recorded(), list[Series](), first
     x = schedule.sample(equations, first, state)
     while left < last:
@@ -164,7 +180,7 @@ def integrate(
         if right - left <= reach * (1.0 + 1e-9):
             right = schedule.on(times, right)
         else:
-            right = left + reach if stops_after is None else _reached(times, left, reach)
+            right = left + reach if stops is None else _reached(times, left, reach)
         if memory.has_delays or not (span and span[-1].right >= right):
             until = right if memory.has_delays else schedule.fixed_after(left)
             error = np.maximum(rounding, memory.rounding)
@@ -176,6 +192,8 @@ def integrate(
         try:
             states = _advanced(solver, series, left, grid, x, last)
         except SolverError:
+            if ended := _ended(found.run(left, x), stops):
+                return ended
             if right - left < shortest:
                 raise
             reach = 0.5 * (right - left)
@@ -185,15 +203,12 @@ def integrate(
             continue
         schedule.add(memory.jumps)
         found.add(series, left, x, grid[requested], states[:, requested])
-        before, x = x, states[:, -1]
+        x = states[:, -1]
         if ends or right < last:
             x = schedule.sample(equations, right, x)
-        if stops_after is not None:
-            grid, states = np.append(left, grid), np.column_stack([before, states])
-            stop = stops_after(grid, states)
-            if stop is not None:
-                return found.run(float(grid[stop]), states[:, stop] if stop < grid.size - 1 else x)
         left, reach = right, min(longest, 2.0 * reach)
+        if stops is not None and stops.within(series, grid, states) and (ended := _ended(found.run(left, x), stops)):
+            return ended
     return found.run(left, x)
 
 
@@ -314,6 +329,12 @@ def _reached(times: Array, left: float, reach: float) -> float:
     """
     before = float(times[np.searchsorted(times, left + reach * (1.0 + 1e-9), side="right") - 1])
     return before if before > left + 0.5 * reach else left + reach
+
+
+def _ended(run: NetworkRun, stops: Stops | None) -> NetworkRun | None:
+    """A run up to the first event that ends it; None if there is none."""
+    stop = None if stops is None or run.times.size == 1 else stops.first(run)
+    return None if stop is None else run.until(stop)
 
 
 def _advanced(solver: Solver, series: Series, left: float, grid: Array, state: Array, last: float) -> Array:

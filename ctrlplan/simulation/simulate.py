@@ -18,7 +18,16 @@ from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.budget import begin_run
-from ctrlplan.simulation.events import Events, Occurrence, Snapshot, Watched, crossings
+from ctrlplan.simulation.events import (
+    Departures,
+    Events,
+    LaterEvents,
+    Occurrence,
+    Snapshot,
+    Watched,
+    crossings,
+    departures_of,
+)
 from ctrlplan.simulation.held_outputs import HeldOutputs
 from ctrlplan.simulation.interpreted import FeedthroughError
 from ctrlplan.simulation.interruptions import passing_interruptions
@@ -322,13 +331,13 @@ def _response(job: Job, record: Record, later: bool) -> tuple[SimulationResponse
         plot_inputs=bool(len(seen.u)),
         method=record.method,
         reason=record.reason,
-        events=found.located if later else found.located(),
+        events=found if later else found(),
     )
     return response, stop, record
 
 
-class _Occurrences:
-    """Crossings of the limits of the events of a record, located when they are required."""
+class _Occurrences(LaterEvents):
+    """Crossings of the limits of the events of a record."""
 
     def __init__(self, record: Record) -> None:
         self._record = record
@@ -340,13 +349,26 @@ class _Occurrences:
         ends = [one for found in self._found.values() for one in found if one.stop]
         return min(ends, key=lambda one: one.time, default=None)
 
-    def located(self) -> list[Occurrence]:
+    def __call__(self) -> list[Occurrence]:
         """All crossings up to the end, in order of time."""
         stop = self.stop()
         self._locate(range(len(self._record.watched)))
         last = math.inf if stop is None else stop.time
         every = [one for k in range(len(self._found)) for one in self._found[k] if one.time <= last]
         return sorted(every, key=lambda one: one.time)
+
+    def departures(self) -> list[Departures]:
+        """Number and first time of the crossings by which signals left their limits; others are not located."""
+        record = self._record
+        if self.stop() is not None:  # those in its interval of time may be after it
+            return Departures.of(self())
+        with passing_interruptions():
+            found = [
+                one
+                for entry in record.watched
+                for one in departures_of(entry, record.times, entry.value(self.seen), partial(_value_at, record, entry))
+            ]
+        return Departures.by_name(found)
 
     @cached_property
     def seen(self) -> Snapshot:
@@ -361,7 +383,7 @@ class _Occurrences:
             for k in missing:
                 entry = record.watched[k]
                 values = entry.value(self.seen)
-                self._found[k] = crossings(entry, record.times, values, partial(_value_at, record, entry))
+                self._found[k] = list(crossings(entry, record.times, values, partial(_value_at, record, entry)))
 
 
 def _value_at(record: Record, entry: Watched, k: int, t: float) -> float:

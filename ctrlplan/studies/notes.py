@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ctrlplan.simulation import Occurrence, what_happened
+from ctrlplan.simulation.response import departures_in
 from ctrlplan.studies.experiment import Measured
 from ctrlplan.studies.measures import Run
 from ctrlplan.studies.units import Signals
@@ -64,12 +65,10 @@ def _notes_of_events(runs: Mapping[str, Run]) -> tuple[str, ...]:
     """Events of each run."""
     notes = []
     for plan, run in runs.items():
-        events = [event for event in run.response.events if event.kind != "inside"]
         happened = []
-        for name in dict.fromkeys(event.name for event in events):
-            at = [event.time for event in events if event.name == name]
-            count = f"{len(at)} times, first " if len(at) > 1 else ""
-            happened.append(f"{what_happened(name)} ({count}at {at[0]:.4g} s)")
+        for name, number, first in departures_in(run.response):
+            count = f"{number} times, first " if number > 1 else ""
+            happened.append(f"{what_happened(name)} ({count}at {first:.4g} s)")
         stop = run.stop
         ended = "" if stop is None else f". The run ended at {stop.time:.4g} s; metrics cover the time before it"
         if happened:

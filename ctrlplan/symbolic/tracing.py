@@ -25,8 +25,8 @@ from ctrlplan.symbolic.symbols import Symbol, column_of, symbol_array
 
 Point = tuple[float, Array, Array, Params]
 """Time, state and input of a block, and parameters."""
-Answer = tuple[Array, Array]
-"""Outputs and rates of a block."""
+Answer = Array
+"""Outputs of a block, then its rates."""
 
 _SAME = 1e-8
 """Relative tolerance between a trace and Python."""
@@ -136,7 +136,7 @@ def _is_log_only(
     """
     for point, values_then in known[::_AGAIN]:
         keeper.restore()
-        if not same_answer(_finite(block, point), values_then):
+        if not _same(_finite(block, point), values_then):
             return False
     keeper.restore()
     traces = [tried(lambda: _trace(block, values, trace.symbols), None) for _ in range(2)]
@@ -165,17 +165,24 @@ def callable_references(blocks: Iterable[Traceable], params: Params) -> Referenc
 def agrees(block: Traceable, trace: Trace, params: Params, t: Array, x: Array, u: Array) -> str:
     """Disagreement of a trace at times (n,), states (nstates, n) and inputs (ninputs, n); empty if it agrees."""
     values = {**block.params, **params}
-    points: list[Point] = [(t[k], x[:, k], u[:, k], values) for k in range(t.size)]
+    functions = block.output(values), block.update(values)
     with untouched():
-        known = [(point, found) for point in points if (found := _finite(block, point)) is not None]
-    return _disagreement(trace, known)
+        answers = [_answer(functions, t[k], x[:, k], u[:, k]) for k in range(t.size)]
+    inside = np.array([k for k, answer in enumerate(answers) if answer is not None], dtype=np.intp)
+    if not inside.size:
+        return ""
+    found = np.array([answers[k] for k in inside]).T
+    finite = np.isfinite(found).all(axis=0)
+    inside, found = inside[finite], found[:, finite]
+    p = np.array([values[key] for key in trace.symbols], dtype=float)
+    return _difference(trace, t[inside], x[:, inside], u[:, inside], np.tile(p[:, None], inside.size), found)
 
 
 def _known(block: Traceable, points: list[Point]) -> list[tuple[Point, Answer]]:
     """Points inside the block's domain with the values of Python, checked to be reproducible."""
     first = [_finite(block, point) for point in points]
     again = [_finite(block, point) for point in points[::_AGAIN]]
-    if not all(same_answer(a, b) for a, b in zip(first[::_AGAIN], again, strict=True)):
+    if not all(_same(a, b) for a, b in zip(first[::_AGAIN], again, strict=True)):
         raise NotTraceableError(
             f"block {block.name} returns different values for equal arguments: it is random or has memory"
         )
@@ -251,21 +258,29 @@ def _points(values: Params, t: float, x: Array, u: Array) -> Iterator[Point]:
 def _finite(block: Traceable, point: Point) -> Answer | None:
     """Outputs and rates by Python, or None outside of the block's domain."""
     t, x, u, values = point
+    functions = tried(lambda: (block.output(values), block.update(values)), None)
+    found = None if functions is None else _answer(functions, t, x, u)
+    return found if found is not None and np.isfinite(found).all() else None
 
-    def answer() -> Answer | None:
-        output, update = (
-            _real(function(t, x.copy(), u.copy())) for function in (block.output(values), block.update(values))
-        )
-        return (output, update) if np.isfinite(output).all() and np.isfinite(update).all() else None
 
-    return tried(answer, None)
+def _answer(functions: tuple[BlockMap, BlockMap], t: float, x: Array, u: Array) -> Answer | None:
+    """Outputs and rates by Python, finite or not; None if a function raises."""
+    try:
+        return np.concatenate([_real(function(t, x.copy(), u.copy())) for function in functions])
+    except (Exception, SystemExit):  # any exception of a block, as in `tried`
+        return None
 
 
 def _real(values: Value) -> Array:
-    found = np.ravel(values)
+    found = np.array(values).ravel()
     if found.dtype.kind == "c":
         raise TypeError("values must be real")
-    return np.array(found, dtype=float)
+    return found.astype(float, copy=False)
+
+
+def _same(a: Answer | None, b: Answer | None) -> bool:
+    """Whether two answers are equal, or both missing."""
+    return same_answer(None if a is None else (a,), None if b is None else (b,))
 
 
 def _trace(block: Traceable, values: Params, symbols: tuple[str, ...]) -> Trace:
@@ -290,9 +305,15 @@ def _disagreement(trace: Trace, known: list[tuple[Point, Answer]]) -> str:
         return ""
     t, x, u = (np.array([point[k] for point, _ in known]).T.reshape(-1, len(known)) for k in range(3))
     p = np.array([[point[3][key] for key in trace.symbols] for point, _ in known], dtype=float).T
-    p = p.reshape(-1, len(known))
+    return _difference(trace, t, x, u, p.reshape(-1, len(known)), np.array([found for _, found in known]).T)
+
+
+def _difference(trace: Trace, t: Array, x: Array, u: Array, p: Array, found: Array) -> str:
+    """First difference of a trace from values (noutputs + nrates, n) by Python; empty if they agree."""
+    if not found.size:
+        return ""
+    t = t.reshape(1, -1)
     traced_values = np.concatenate([f(t, x, u, p).full() for f in (trace.output, trace.update)])
-    found = np.array([np.concatenate(values) for _, values in known]).T
     # For a value that is small by cancellation the tolerance is relative to its magnitude elsewhere.
     size = np.maximum(np.abs(found), 1e-3 * np.abs(found).max(axis=1, keepdims=True))
     wrong = ~(np.abs(traced_values - found) <= _SAME * size)

@@ -11,7 +11,8 @@ from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan.simulation import Event, Occurrence
-from ctrlplan.simulation.events import Watched, crossings
+from ctrlplan.simulation.events import Departures, Watched, crossings
+from ctrlplan.simulation.response import departures_in
 from ctrlplan.simulation.simulate import simulate_for_metrics
 
 METHODS = ("exact", "compiled", "python")
@@ -213,6 +214,45 @@ def test_the_first_of_several_stops_counts(method):
     assert abs(found.time[-1] + math.log(0.7)) <= ALLOWED[method]
 
 
+def pulse_at_two(rates):
+    """A state with given rates from 0, and a narrow pulse of it at 2: above 0.5 for a few samples."""
+    return ct.nlsys(
+        rates,
+        lambda t, x, u, p: np.exp(-(((x[0] - 2.0) / 0.01) ** 2)),
+        inputs=0,
+        outputs=["y"],
+        states=["x"],
+        name="pulse",
+    )
+
+
+@pytest.mark.parametrize("method", ["compiled", "python"])
+@pytest.mark.parametrize("end", [2.05, 10.0])
+def test_a_run_ends_in_a_short_pulse(method, end):
+    times = np.linspace(0.0, end, 1001)
+    stop = Event("y", high=0.5, stop=True)
+    found = cp.simulate(pulse_at_two(lambda t, x, u, p: [1.0]), times, method=method, events=[stop])
+    exact = 2.0 - 0.01 * math.sqrt(math.log(2.0))
+    assert [o.stop for o in found.events] == [True]
+    assert abs(found.time[-1] - exact) <= 1e-9
+    assert np.abs(found.states[0] - found.time).max() <= 1e-9
+    assert np.array_equal(found.time[:-1], times[times < exact])
+
+
+@pytest.mark.parametrize("method", ["compiled", pytest.param("python", marks=pytest.mark.slow)])
+def test_a_run_ends_in_a_short_pulse_before_its_solution_does(method):
+    def rates(t, x, u, p):
+        return [1.0 / np.sqrt(3.0 - x[0])]  # (3 - x)^(3/2) = 3^(3/2) - 1.5 t
+
+    times = np.linspace(0.0, 11.0, 2001)
+    stop = Event("y", high=0.5, stop=True)
+    with np.errstate(all="ignore"):
+        found = cp.simulate(pulse_at_two(rates), times, method=method, events=[stop])
+    level = 1.0 + 0.01 * math.sqrt(math.log(2.0))
+    assert abs(found.time[-1] - (3.0**1.5 - level**1.5) / 1.5) <= 1e-8
+    assert [o.stop for o in found.events] == [True]
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_a_stop_that_is_not_reached_changes_nothing(method):
     plain = cp.simulate(LAG, T, 1.0, method=method)
@@ -390,6 +430,17 @@ def limited():
     return ct.interconnect([gain, limits, plant], inputs="r", outputs=["y", "u"], name="limited")
 
 
+def test_departures_are_counted_and_the_first_is_located():
+    """y = sin t, v = cos t: v is above 0.9 at the start."""
+    events = [Event("y", low=-0.5, high=0.5), Event("v", high=0.9, name="far"), Event("y", high=0.99, name="far")]
+    later = simulate_for_metrics(OSCILLATOR, T, None, [0.0, 1.0], events=events)[0]
+    found = departures_in(later)
+    assert [(one.name, one.number) for one in found] == [("far", 4), ("y", 4)]
+    assert np.abs([found[0].first, found[1].first - math.pi / 6]).max() <= 1e-11
+    assert found == Departures.of(later.events)
+    assert departures_in(cp.simulate(OSCILLATOR, T, None, [0.5, 0.0], events=[Event("y", high=0.6)])) == []
+
+
 @pytest.mark.parametrize("stop", [False, True])
 def test_events_read_later_are_those_of_simulate(stop):
     events = [Event("y", high=0.9, stop=stop), Event("y", low=0.25, high=0.75)]
@@ -405,6 +456,16 @@ def test_events_read_later_are_those_of_simulate(stop):
     assert end is None or (end.stop and later.time[-1] == end.time)
     assert np.array_equal(later.time, now.time)
     assert np.array_equal(later.outputs, now.outputs)
+
+
+@pytest.mark.parametrize("stop", [False, True])
+def test_departures_of_events_that_are_not_located_are_those_of_simulate(stop):
+    events = [Event("y", high=0.9, stop=stop), Event("y", low=0.25, high=0.75)]
+    later = departures_in(simulate_for_metrics(limited(), T, 1.0, events=events)[0])
+    every = Departures.of(cp.simulate(limited(), T, 1.0, events=events).events)
+    assert [one[:2] for one in later] == [one[:2] for one in every]
+    assert np.abs(np.subtract([one.first for one in later], [one.first for one in every])).max() <= 1e-9
+    assert max(one.number for one in later) > 1
 
 
 def test_functions_of_the_user_are_not_called_later():
@@ -433,7 +494,8 @@ def watched(value):
         return float(value(t))
 
     entry = Watched("s", lambda snapshot: snapshot.t, -math.inf, 0.0)
-    return crossings(entry, times, np.array([float(value(t)) for t in times]), at), len(seen)
+    found = list(crossings(entry, times, np.array([float(value(t)) for t in times]), at))
+    return found, len(seen)
 
 
 @pytest.mark.parametrize(

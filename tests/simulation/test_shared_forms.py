@@ -7,11 +7,13 @@ from itertools import pairwise
 import control as ct
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import ctrlplan as cp
 from ctrlplan.simulation import compiled, numerical
 from ctrlplan.simulation.built_forms import NotApplicableError, shared_forms
 from ctrlplan.simulation.job import with_event_times
+from ctrlplan.symbolic import tracing
 
 pytest.importorskip("casadi")
 TIMES = np.linspace(0.0, 4.0, 81)
@@ -112,6 +114,34 @@ def test_a_block_that_cannot_be_compiled_is_tried_in_each_loop(built):
             with pytest.raises(NotApplicableError, match="damped cannot be traced"):
                 cp.simulate(fed(plan, branching), TIMES, method="compiled")
     assert not built
+
+
+def limited(plan, gain):
+    """`damped` with a smooth limit of its source by another block."""
+
+    def update(t, x, u, params):
+        return [2.0 * (u[0] - x[0]) - x[0] ** 3]
+
+    source = cp.create_source_iosystem(cp.stack([plan], labels=["p"]), suffix="", name="plan")
+    limit = ct.nlsys(None, lambda t, x, u, params: [np.tanh(gain * u[0])], inputs=["p"], outputs=["r"], name="limit")
+    block = ct.nlsys(update, None, inputs=["r"], outputs=["y"], states=1, name="damped")
+    return ct.interconnect([source, limit, block], inputs=0, outputs=["y"])
+
+
+@pytest.mark.parametrize(("context", "once"), [(shared_forms, True), (nullcontext, False)])
+def test_a_block_of_several_loops_is_traced_once(monkeypatch, context, once):
+    names, whole, plan = [], tracing.traced, PLANS["polynomial"]
+    monkeypatch.setattr(tracing, "traced", lambda block, *others: names.append(block.name) or whole(block, *others))
+    with context():
+        for gain in (1.0, 3.0):
+            found = cp.simulate(limited(plan, gain), TIMES, method="compiled")
+
+            def rates(t, x, gain=gain):
+                return 2.0 * (np.tanh(gain * float(plan(min(t, 1.0)))) - x) - x**3
+
+            peer = solve_ivp(rates, TIMES[[0, -1]], [0.0], t_eval=TIMES, rtol=1e-10, atol=1e-12, max_step=0.05)
+            assert np.abs(found.outputs - peer.y[0]).max() <= 1e-7
+    assert sorted(names) == ["damped"] * (1 if once else 2) + ["limit"] * 2
 
 
 def test_times_of_events_divide_the_intervals_of_samples():
