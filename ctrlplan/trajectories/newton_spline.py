@@ -261,9 +261,7 @@ class NewtonSpline(WaypointSpline):
         scale = derivative_scale(self._duration, order)
         out = np.empty((order + 1, self.naxes, u.size))
         for axes, system, coefficients in self._parts:
-            taylor = system.taylor(u, order)
-            values = coefficients.T @ taylor.reshape(system.size, -1)
-            values = by_orders(values.reshape(len(axes), order + 1, u.size).transpose(1, 0, 2), scale[:, None, None])
+            values = by_orders(system.jet(coefficients, u, order), scale[:, None, None])
             if len(axes) == self.naxes:
                 return values
             out[:, list(axes)] = values

@@ -79,8 +79,7 @@ class Pieces(Fields):
     def jet(self, segment: int, u: Array, order: int) -> Array:
         """Derivatives (order + 1, naxes, ntime) by the relative time in a segment."""
         system, coefficients = self.of_segment(segment)
-        values = coefficients.T @ system.taylor(u, order).reshape(system.size, -1)
-        return values.reshape(len(self.axes), order + 1, u.size).transpose(1, 0, 2)
+        return system.jet(coefficients, u, order)
 
     def jets(self, segments: NDArray[np.intp], u: Array, order: int) -> Array:
         """Taylor coefficients (order + 1, naxes, ntime) by the relative time, each time in its own segment."""
