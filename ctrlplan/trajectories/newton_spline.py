@@ -255,6 +255,15 @@ class NewtonSpline(WaypointSpline):
         """Derivatives of the only segment; as `Trajectory.segments_jet`."""
         return self.segment_jet(0, s, order)
 
+    def at_fractions(self, fractions: Array, nu: int) -> Array:
+        """Derivative at relative times; as `Trajectory.at_fractions`."""
+        if is_moderate(self._duration, nu):
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = self._jet(fractions * self._duration, nu)[nu]
+                if are_finite(found):
+                    return found[:, None]
+        return super().at_fractions(fractions, nu)
+
     def _jet(self, s: Array, order: int) -> Array:
         """Derivatives (order + 1, naxes, ntime) at times since the start."""
         u = s / self._duration

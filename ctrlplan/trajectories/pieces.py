@@ -81,6 +81,11 @@ class Pieces(Fields):
         system, coefficients = self.of_segment(segment)
         return system.jet(coefficients, u, order)
 
+    def at_fractions(self, u: Array, order: int) -> Array:
+        """Taylor coefficient (naxes, nsegments, ntime) of an order at the same relative times of all segments."""
+        found = [_on_segments(run, run.system.taylor_between(u, order)[order]) for run in self.runs]
+        return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
+
     def jets(self, segments: NDArray[np.intp], u: Array, order: int) -> Array:
         """Taylor coefficients (order + 1, naxes, ntime) by the relative time, each time in its own segment."""
         out = np.empty((order + 1, len(self.axes), u.size))
@@ -267,6 +272,13 @@ def _rows(run: Run, basis: Array, segments: NDArray[np.intp]) -> Array:
     if segments.size < len(coefficients):
         coefficients = coefficients[segments - run.first]
     return np.asarray(coefficients[:, None] @ basis)
+
+
+def _on_segments(run: Run, functions: Array) -> Array:
+    """Values (naxes, nsegments, ntime) from those of the basis (size, ntime)."""
+    size, naxes, nsegments = run.coefficients.shape
+    values = run.coefficients.reshape(size, -1).T @ functions  # one product of matrices
+    return np.asarray(values.reshape(naxes, nsegments, -1))
 
 
 def _gathered(run: Run, segments: NDArray[np.intp], u: Array, order: int) -> Array:

@@ -146,6 +146,17 @@ def test_shapes(plan):
     np.testing.assert_array_equal(plan([0, 1, 2]), plan(np.array([0.0, 1.0, 2.0])))
 
 
+@moving
+@pytest.mark.parametrize("nu", [0, 1, 3, 5])
+def test_derivatives_at_fractions_of_all_segments_are_those_at_these_times(plan, nu):
+    fractions = np.array([0.1, 0.45, 0.9])
+    inside = plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * fractions
+    found, wanted = plan.at_fractions(fractions, nu), plan.jet(inside, nu)[nu]
+    assert found.shape == (plan.naxes, plan.breakpoints.size - 1, 3)
+    size = sizes(plan, nu + 1)[nu:].max(axis=0)  # of the derivative, and of its change by rounding of times
+    assert (np.abs(found - wanted) <= 1e-12 * size[:, None, None]).all()
+
+
 @every
 def test_value_and_jet_are_the_same_in_any_order(plan):
     t = times(plan)
