@@ -26,7 +26,7 @@ from ctrlplan.trajectories.common import (
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, shared_system
 from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
-from ctrlplan.trajectories.sampling import Interpolant
+from ctrlplan.trajectories.sampling import FEW, Extent, Interpolant
 from ctrlplan.trajectories.swing import warn_of_swing, within
 from ctrlplan.trajectories.waypoint import Waypoint, joined
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
@@ -247,6 +247,12 @@ class NewtonSpline(WaypointSpline):
             rows = self.segment_rows(segment, float(s[0]), order)
             if rows is not None:
                 return np.array(rows).T[:, :, None]
+        if s.size > FEW and is_moderate(self._duration, order):
+            extent = Extent.of(s)
+            if extent.first >= 0.0 and extent.last <= self._moments[1] - self._moments[0]:
+                found = np.empty((order + 1, self.naxes, s.size))
+                self._sample_many(segment, s, 0, found, extent)
+                return found
         found = self._jet(s, order)
         self._place_ends(segment, s, 0, found)
         return found
