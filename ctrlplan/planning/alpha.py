@@ -20,6 +20,7 @@ from ctrlplan.planning.objectives import (
     SquaredDerivative,
     checked_objective,
     declared_size,
+    objective_values,
 )
 from ctrlplan.planning.scalar_search import bisected, scan
 from ctrlplan.trajectories import Trajectory, TrigSpline, Waypoint
@@ -175,7 +176,8 @@ def choose_alpha(
         return family(points, alpha=alpha, **quiet)
 
     search = _Search(plan_of, goal)
-    alphas, values = scan(search, _grid(points))
+    grid = _grid(points)
+    alphas, values = scan(search, grid, values=search.values(grid))
     best = float(values.min())
     if math.isinf(best):
         raise search.rejection or ValueError("objective must be finite for some alpha, got inf for all of [0, 2 pi)")
@@ -217,17 +219,26 @@ class _Search:
         self.rejection: ValueError | None = None
 
     def __call__(self, alpha: float) -> float:
-        try:
-            plan = self._plan_of(float(alpha))
-        except ValueError as rejection:  # with free entries the system may be singular at some alphas
-            self.rejection = self.rejection or rejection
-            return math.inf
-        value: Any = self._goal(plan)
-        if np.ndim(value) or not isinstance(value, Real | np.ndarray):
-            raise TypeError(f"objective must return a number, got {value!r:.60} at alpha = {alpha:.6g}")
-        if not float(value) > -math.inf:
-            raise ValueError(f"objective must return a number above -inf, got {value} at alpha = {alpha:.6g}")
-        return float(value)
+        return self.values(np.array([alpha])).item()
+
+    def values(self, alphas: Array) -> Array:
+        """Values at several alphas."""
+        found = np.full(alphas.size, math.inf)
+        plans, places = [], []
+        for k, alpha in enumerate(alphas.tolist()):
+            try:
+                plans.append(self._plan_of(alpha))
+            except ValueError as rejection:  # with free entries the system may be singular at some alphas
+                self.rejection = self.rejection or rejection
+            else:
+                places.append(k)
+        for k, value in zip(places, objective_values(self._goal, plans), strict=True):
+            if np.ndim(value) or not isinstance(value, Real | np.ndarray):
+                raise TypeError(f"objective must return a number, got {value!r:.60} at alpha = {alphas[k]:.6g}")
+            if not float(value) > -math.inf:
+                raise ValueError(f"objective must return a number above -inf, got {value} at alpha = {alphas[k]:.6g}")
+            found[k] = float(value)
+        return found
 
 
 def _grid(points: tuple[Waypoint, ...]) -> Array:

@@ -65,6 +65,9 @@ _NEAR = 1e-8
 _INWARDS = 4.0 * float(np.finfo(float).eps)
 """Distance from a boundary of the feasible durations, relative to it, within which a signal may exceed by rounding."""
 
+_SAME = 16.0 * _INWARDS
+"""Change of a boundary of the feasible durations, relative to it, that is rounding."""
+
 _WIDTHS = 1e-7 * 8.0 ** np.arange(6.0)
 """Changes of a duration within which its excess at one time is searched for a root, relative to it."""
 
@@ -1113,7 +1116,12 @@ def _searched(family: PlansByDuration, span: tuple[float, float] | None, hold: H
         _reject(family, durations, excess)
     if endless and feasible[-1][1] == durations[-1]:
         feasible[-1] = (feasible[-1][0], math.inf)
-    plan, found = _satisfying(limited, family.plan, feasible[0][0])
+    shortest = feasible[0][0]
+    known = family.margins(shortest) if family.is_known(shortest) else None
+    if known is not None and known.satisfied:
+        plan, found = family.plan(shortest), known
+    else:
+        plan, found = _satisfying(limited, family.plan, shortest)
     # If no limit is active, shorter plans are infeasible for the plant.
     rejection = limited.rejection(family.plan(0.99 * plan.duration)) if found.active.fraction > 1e-6 else ""
     searched = (float(durations[0]), math.inf if math.isinf(feasible[-1][1]) else float(durations[-1]))
@@ -1165,16 +1173,18 @@ def _edge(family: PlansByDuration, middle: float, inside: float, outside: float)
     alone. Its root differs from the boundary by the square of the distance from
     the duration at which that time was found.
     """
-    edge = _sampled_root(family, inside, outside)
+    edge, inwards = _sampled_root(family, inside, outside), 1.0 + math.copysign(_INWARDS, inside - outside)
     peak = None if edge is None else family.peak(edge)
     if edge is not None and peak is not None:
-        edge = _root_at(family, edge, *peak) or edge
+        edge = (_root_at(family, edge, *peak) or edge) * inwards
     for _ in range(_STEPS if edge is not None else 0):
         root = None if edge is None else _root_at_extremum(family, edge)
         if root is None or edge is None or not min(inside, outside) <= root <= max(inside, outside):
             break
         if abs(root - edge) <= _NEAR * edge:
-            return root * (1.0 + math.copysign(_INWARDS, inside - outside))
+            root *= inwards
+            # The margins of the former are known.
+            return edge if abs(root - edge) <= _SAME * edge and family.exact_excess(edge) <= 0.0 else root
         edge = root
     return _feasible_edge(family.exact_excess, family.excess, middle, outside)
 

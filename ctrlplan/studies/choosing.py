@@ -21,6 +21,7 @@ from ctrlplan.planning import (
     optimize_waypoints,
     plan_length,
 )
+from ctrlplan.planning.objectives import plan_lengths
 from ctrlplan.studies.baselines import smoother_polynomials
 from ctrlplan.studies.benefit import PLANNED, Benefit, Choices, benefit_of
 from ctrlplan.studies.crane_setup import (
@@ -128,7 +129,7 @@ def optimality_grids() -> tuple[Grid, Grid]:
             "m",
             ends,
             alphas,
-            np.array([[plan_length(plan) for plan in row] for row in shapes]),
+            np.array([plan_lengths(row) for row in shapes]),
             {name: np.array([plan_length(row[name]) for row in baselines]) for name in baselines[0]}
             | {_POLYLINE: np.array(polyline)},
             not_ranked=(_POLYLINE,),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ctrlplan import metrics
 from ctrlplan.planning import Fastest, avoid, plan_length
+from ctrlplan.planning.objectives import plan_lengths
 from ctrlplan.simulation import simulate
 from ctrlplan.simulation.built_forms import shared_forms
 from ctrlplan.simulation.simulate import simulate_for_metrics
@@ -488,8 +489,8 @@ def _length_curves() -> Curves:
     rows = {}
     for duration in (14.0, 16.0, 20.0):
         points = obstacle_waypoints(duration)
-        lengths = [plan_length(TrigSpline(points, alpha=a, warn=False)) for a in alphas.tolist()]
-        rows[f"one plan, {duration:g} s"] = np.array(lengths)
+        plans = [TrigSpline(points, alpha=a, warn=False) for a in alphas.tolist()]
+        rows[f"one plan, {duration:g} s"] = plan_lengths(plans)
         rows[f"one quintic per segment, {duration:g} s"] = np.full(alphas.size, plan_length(PiecewiseSpline(points)))
     return Curves(
         "alpha [rad] (0: polynomial)",

@@ -91,8 +91,9 @@ _STORED = 64
 _SHORT = 4
 """Maximum number of waypoints whose coefficients bound the range of a plan."""
 
-_ELEMENTARY = 3
-"""Highest order of Taylor coefficients from elementary symmetric sums."""
+_ELEMENTARY, _BETWEEN, _APART = 3, 256, 1e-12
+"""Highest order of Taylor coefficients from elementary symmetric sums, the number of times up to which these are the
+faster ones, and the distance from a node above which their ratios cannot overflow."""
 
 NEARLY_CLOSED = 5.0
 """Alpha [rad] above which both ends may coincide."""
@@ -411,7 +412,7 @@ class NewtonSystem(Fields):
         return np.asarray(out[: self.size, pattern.waypoints, pattern.orders].T)
 
     def taylor_between(self, u: Array, order: int) -> Array:
-        r"""As `taylor`, faster at few times, none of which is a node.
+        r"""As `taylor`, faster at few times, none of which is near a node.
 
         A factor f with f'' = -2 w f, where w = alpha^2/8, has the series
 
@@ -429,7 +430,7 @@ class NewtonSystem(Fields):
         if order > _ELEMENTARY:
             return self.taylor(u, order).transpose(1, 0, 2)
         apart = u - self._nodes[:count, None]
-        if np.count_nonzero(apart) < apart.size:
+        if np.count_nonzero(np.abs(apart) > _APART) < apart.size:
             return self.taylor(u, order).transpose(1, 0, 2)
         out = np.zeros((order + 1, count + 1, u.size))
         value, bend = out[0], 0.5 * half * half
@@ -456,6 +457,23 @@ class NewtonSystem(Fields):
         if self._fold:
             out[:, self.size - 1] += self._fold * out[:, self.size]
         return out[:, : self.size]
+
+    def jet(self, coefficients: Array, u: Array, order: int) -> Array:
+        """Taylor coefficients (order + 1, naxes, ntime) of functions at normalised times.
+
+        Parameters
+        ----------
+        coefficients : ndarray, shape (size, naxes)
+            Of the functions of the basis.
+        u : ndarray, shape (ntime,)
+            Normalised times.
+        order : int
+            Highest coefficient.
+        """
+        if order <= _ELEMENTARY and u.size <= _BETWEEN:
+            return np.asarray(coefficients.T @ self.taylor_between(u, order))
+        values = coefficients.T @ self.taylor(u, order).reshape(self.size, -1)
+        return np.asarray(values.reshape(coefficients.shape[1], order + 1, u.size).transpose(1, 0, 2))
 
     def interpolant(self, coefficients: Array, low: int, high: int) -> Array:
         """Interpolants (high - low + 1, naxes, nterms) of Taylor coefficients on the unit interval.

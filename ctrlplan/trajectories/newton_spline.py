@@ -26,7 +26,7 @@ from ctrlplan.trajectories.common import (
 from ctrlplan.trajectories.extrema import keep_places
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, shared_system
 from ctrlplan.trajectories.one_time import derivatives, effective, is_moderate
-from ctrlplan.trajectories.sampling import Interpolant
+from ctrlplan.trajectories.sampling import FEW, Extent, Interpolant
 from ctrlplan.trajectories.swing import warn_of_swing, within
 from ctrlplan.trajectories.waypoint import Waypoint, joined
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
@@ -247,6 +247,12 @@ class NewtonSpline(WaypointSpline):
             rows = self.segment_rows(segment, float(s[0]), order)
             if rows is not None:
                 return np.array(rows).T[:, :, None]
+        if s.size > FEW and is_moderate(self._duration, order):
+            extent = Extent.of(s)
+            if extent.first >= 0.0 and extent.last <= self._moments[1] - self._moments[0]:
+                found = np.empty((order + 1, self.naxes, s.size))
+                self._sample_many(segment, s, 0, found, extent)
+                return found
         found = self._jet(s, order)
         self._place_ends(segment, s, 0, found)
         return found
@@ -255,15 +261,22 @@ class NewtonSpline(WaypointSpline):
         """Derivatives of the only segment; as `Trajectory.segments_jet`."""
         return self.segment_jet(0, s, order)
 
+    def at_fractions(self, fractions: Array, nu: int) -> Array:
+        """Derivative at relative times; as `Trajectory.at_fractions`."""
+        if is_moderate(self._duration, nu):
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = self._jet(fractions * self._duration, nu)[nu]
+                if are_finite(found):
+                    return found[:, None]
+        return super().at_fractions(fractions, nu)
+
     def _jet(self, s: Array, order: int) -> Array:
         """Derivatives (order + 1, naxes, ntime) at times since the start."""
         u = s / self._duration
         scale = derivative_scale(self._duration, order)
         out = np.empty((order + 1, self.naxes, u.size))
         for axes, system, coefficients in self._parts:
-            taylor = system.taylor(u, order)
-            values = coefficients.T @ taylor.reshape(system.size, -1)
-            values = by_orders(values.reshape(len(axes), order + 1, u.size).transpose(1, 0, 2), scale[:, None, None])
+            values = by_orders(system.jet(coefficients, u, order), scale[:, None, None])
             if len(axes) == self.naxes:
                 return values
             out[:, list(axes)] = values

@@ -79,8 +79,12 @@ class Pieces(Fields):
     def jet(self, segment: int, u: Array, order: int) -> Array:
         """Derivatives (order + 1, naxes, ntime) by the relative time in a segment."""
         system, coefficients = self.of_segment(segment)
-        values = coefficients.T @ system.taylor(u, order).reshape(system.size, -1)
-        return values.reshape(len(self.axes), order + 1, u.size).transpose(1, 0, 2)
+        return system.jet(coefficients, u, order)
+
+    def at_fractions(self, u: Array, order: int) -> Array:
+        """Taylor coefficient (naxes, nsegments, ntime) of an order at the same relative times of all segments."""
+        found = [_on_segments(run, run.system.taylor_between(u, order)[order]) for run in self.runs]
+        return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
 
     def jets(self, segments: NDArray[np.intp], u: Array, order: int) -> Array:
         """Taylor coefficients (order + 1, naxes, ntime) by the relative time, each time in its own segment."""
@@ -268,6 +272,13 @@ def _rows(run: Run, basis: Array, segments: NDArray[np.intp]) -> Array:
     if segments.size < len(coefficients):
         coefficients = coefficients[segments - run.first]
     return np.asarray(coefficients[:, None] @ basis)
+
+
+def _on_segments(run: Run, functions: Array) -> Array:
+    """Values (naxes, nsegments, ntime) from those of the basis (size, ntime)."""
+    size, naxes, nsegments = run.coefficients.shape
+    values = run.coefficients.reshape(size, -1).T @ functions  # one product of matrices
+    return np.asarray(values.reshape(naxes, nsegments, -1))
 
 
 def _gathered(run: Run, segments: NDArray[np.intp], u: Array, order: int) -> Array:

@@ -16,6 +16,7 @@ from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.chosen import checked_alpha, chosen_alpha
 from ctrlplan.trajectories.common import (
+    FACTORIALS,
     Array,
     are_finite,
     by_orders,
@@ -496,6 +497,24 @@ class PiecewiseSpline(WaypointSpline):
         durations = self._durations
         shortest, longest = durations.item(durations.argmin()), durations.item(durations.argmax())
         return max(abs(math.log10(shortest)), abs(math.log10(longest)))
+
+    def at_fractions(self, fractions: Array, nu: int) -> Array:
+        """Derivative at relative times; as `Trajectory.at_fractions`."""
+        if not self._is_extreme(nu):
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = self._at_fractions(fractions, nu)
+                if are_finite(found):
+                    return found
+        return super().at_fractions(fractions, nu)
+
+    def _at_fractions(self, fractions: Array, nu: int) -> Array:
+        scale = FACTORIALS[nu] * self._durations[:, None] ** -nu
+        if len(self._pieces) == 1:
+            return self._pieces[0].at_fractions(fractions, nu) * scale
+        out = np.empty((self.naxes, len(scale), fractions.size))
+        for pieces in self._pieces:
+            out[list(pieces.axes)] = pieces.at_fractions(fractions, nu) * scale
+        return out
 
     def _jets(self, segments: NDArray[np.intp], s: Array, low: int, high: int) -> Array:
         """Derivatives low to high, each time in its own segment."""

@@ -202,6 +202,23 @@ class Trajectory(Displayed, Fields, ABC):
             out[:, :, where] = self.segment_jet(int(segments[where[0]]), s[where], order)
         return out
 
+    def at_fractions(self, fractions: Array, nu: int) -> Array:
+        """Derivative at the same relative times of all segments.
+
+        Parameters
+        ----------
+        fractions : ndarray, shape (ntime,)
+            Times since the start of each segment, relative to its duration, from 0 to 1.
+        nu : int
+            Order of the derivative.
+
+        Returns
+        -------
+        ndarray, shape (naxes, nsegments, ntime)
+        """
+        times = self.breakpoints[:-1, None] + np.diff(self.breakpoints)[:, None] * fractions
+        return self._sample(times.ravel(), nu, nu, False).reshape(self.naxes, *times.shape)
+
     @abstractmethod
     def map_time(self, origin: float, target: float, rate: float) -> Self:
         """Same path with time t moved to target + (t - origin)/rate.

@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 import ctrlplan as cp
 from ctrlplan import Waypoint
 from ctrlplan.planning import OBJECTIVES, PeakDerivative, SquaredDerivative, plan_excess_length, plan_length
-from ctrlplan.planning.objectives import ObjectiveName, declared_size, of_size
+from ctrlplan.planning.objectives import ObjectiveName, declared_size, of_size, plan_lengths
 
 REST = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]
 MOVE = cp.PolySpline(REST)
@@ -42,6 +42,26 @@ NAMES = {
         for k, name in enumerate(["velocity", "acceleration", "jerk", "snap"], 1)
     },
 }
+
+
+class Loops(cp.Trajectory):
+    """A straight line for 1 s, then for 2 s a line with circles of radius 1/4, some a second."""
+
+    breakpoints, labels, waypoints = np.array([0.0, 1.0, 3.0]), ("x", "z"), ()
+
+    def __init__(self, turns):
+        vars(self)["turns"] = turns
+
+    def segment_jet(self, segment, s, order):
+        line, rate = [s + segment, np.ones_like(s)], 2 * pi * self.turns
+        jet = [line[k] if k < 2 else np.zeros_like(s) for k in range(order + 1)]
+        circle = [0.25 * (1j * rate) ** k * np.exp(1j * rate * s) if segment else 0.0 * s for k in range(order + 1)]
+        return np.array([[x + c.imag, c.real] for x, c in zip(jet, circle, strict=True)])
+
+    def segment_series(self, segment, s, order):
+        raise NotImplementedError
+
+    map_time = to_dict = from_dict = segment_series
 
 
 def integral(plan, integrand):
@@ -81,6 +101,30 @@ def test_plan_length_where_the_path_nearly_stops_more_than_once_in_a_panel(alpha
     times = panels[:-1, None] + 14.0 / 4000 * (1.0 + nodes) / 2
     expected = float((np.hypot(*plan.jet(times, 1)[1]) @ weights).sum()) * 14.0 / 8000
     assert plan_length(plan) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 3, 200])
+def test_lengths_of_many_plans_are_those_of_each(count):
+    rng = np.random.default_rng(4)
+    shapes = rng.normal(size=(count, *JETS.shape))
+    kinds = cp.PiecewiseSpline, cp.PolySpline
+    plans = [
+        kinds[k % 2]([Waypoint(t, *jet) for t, jet in zip(TIMES, jets, strict=True)], warn=False)
+        for k, jets in enumerate(shapes)
+    ]
+    assert plan_lengths(plans) == pytest.approx([plan_length(plan) for plan in plans], rel=1e-14)
+    assert plan_lengths([plan.select("y1") for plan in plans]) == pytest.approx(
+        [plan_length(plan.select("y1")) for plan in plans], rel=1e-14
+    )
+    assert plan_lengths([]).size == 0
+
+
+@pytest.mark.parametrize("turns", [1, 12, 60])
+def test_plan_length_of_many_turns_in_one_segment(turns):
+    """With more turns than one interpolant of the velocity on the segment resolves."""
+    rate = 0.5 * pi * turns  # of the velocity on the circle
+    turn = quad(lambda a: sqrt(1 + rate**2 + 2 * rate * cos(a)), 0, 2 * pi, epsabs=0, epsrel=1e-12)[0]
+    assert plan_length(Loops(turns)) == pytest.approx(1.0 + 2.0 * turn / (2 * pi), rel=1e-9)
 
 
 def test_plan_length_of_a_half_circle():

@@ -196,3 +196,20 @@ def test_no_scale_gives_nan(duration, position, velocity):
     size = max(far, speed * length)
     assert abs(jets[0, 0, 0]) <= 1e-12 * size + 1e-300
     assert math.isclose(jets[0, 0, -1], far, rel_tol=1e-12, abs_tol=1e-12 * size)
+
+
+@pytest.mark.parametrize("name", ["TrigSpline", "PolySpline", "PiecewiseSpline", "free", "cyclic", "Sum"])
+@pytest.mark.parametrize("factor", [1.0, 1e100])
+@pytest.mark.parametrize("exponent", [-160, -60, 60, 160])
+def test_derivatives_at_fractions_of_segments_fail_where_those_at_times_do(name, exponent, factor):
+    plan, _ = attempt(lambda: factor * PLANS[name].retime(10.0**exponent))
+    if plan is None:  # the plan itself is no number
+        return
+    fractions = np.array([0.25, 0.5, 0.9])
+    times = plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * fractions
+    for nu in (1, 2):
+        found, message = attempt(lambda nu=nu: plan.at_fractions(fractions, nu))
+        wanted, said = attempt(lambda nu=nu: plan.jet(times, nu)[nu])
+        assert message == said
+        if wanted is not None:
+            assert (np.abs(found - wanted) <= 1e-11 * np.abs(wanted).max()).all()

@@ -351,8 +351,22 @@ def test_times_in_any_order_of_few_and_many_segments(n, left):
 
 def test_functions_at_nodes_and_of_high_orders_are_those_of_all_times():
     system = NewtonSystem(1.0, np.array([0.0, 0.5, 1.0]), ((0, 1), (0, 1), (0, 1)))
-    for u, order in ((np.array([0.2, 0.5]), 2), (np.array([0.2, 0.7]), 5)):
+    cases = (np.array([0.2, 0.5]), 2), (np.array([0.2, 0.7]), 5), (np.array([1e-200, 0.7]), 3)  # at a node, or near
+    for u, order in cases:
         np.testing.assert_array_equal(system.taylor_between(u, order), system.taylor(u, order).transpose(1, 0, 2))
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1e-9, 0.7, 3.0, 2 * np.pi])
+@pytest.mark.parametrize("count", [7, 300])
+@pytest.mark.parametrize("order", [0, 1, 3, 5])
+def test_jets_are_sums_of_the_functions(alpha, count, order):
+    rng = np.random.default_rng(5)
+    system = NewtonSystem(alpha, np.array([0.0, 0.3, 1.0]), ((0, 1, 2), (0,), (0, 1)))
+    coefficients, u = rng.normal(size=(system.size, 3)), np.sort(rng.uniform(size=count))
+    series = system.taylor(u, order)
+    wanted = np.einsum("ma,mkt->kat", coefficients, series)
+    size = np.einsum("ma,mk->ka", np.abs(coefficients), np.abs(series).max(axis=2))
+    assert (np.abs(system.jet(coefficients, u, order) - wanted) <= 50 * EPS * size[:, :, None]).all()
 
 
 @pytest.mark.parametrize("alpha", [0.0, 2.0])

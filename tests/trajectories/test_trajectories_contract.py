@@ -146,6 +146,29 @@ def test_shapes(plan):
     np.testing.assert_array_equal(plan([0, 1, 2]), plan(np.array([0.0, 1.0, 2.0])))
 
 
+@moving
+def test_jets_of_a_segment_at_many_times_are_those_at_few(plan):
+    """Also a little outside of the segment, where its function continues."""
+    low, high = segments(plan)[0]
+    for beyond in (0.0, 0.01):
+        s = np.linspace(-beyond, 1.0 + beyond, 600) * (high - low)
+        found = plan.segment_jet(0, s, 4)
+        few = np.concatenate([plan.segment_jet(0, part, 4) for part in np.split(s, 6)], axis=2)
+        size = np.abs(few).max(axis=2, keepdims=True)
+        assert (np.abs(found - few) <= 1e-12 * size.max(axis=1, keepdims=True)).all()
+
+
+@moving
+@pytest.mark.parametrize("nu", [0, 1, 3, 5])
+def test_derivatives_at_fractions_of_all_segments_are_those_at_these_times(plan, nu):
+    fractions = np.array([0.1, 0.45, 0.9])
+    inside = plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * fractions
+    found, wanted = plan.at_fractions(fractions, nu), plan.jet(inside, nu)[nu]
+    assert found.shape == (plan.naxes, plan.breakpoints.size - 1, 3)
+    size = sizes(plan, nu + 1)[nu:].max(axis=0)  # of the derivative, and of its change by rounding of times
+    assert (np.abs(found - wanted) <= 1e-12 * size[:, None, None]).all()
+
+
 @every
 def test_value_and_jet_are_the_same_in_any_order(plan):
     t = times(plan)
