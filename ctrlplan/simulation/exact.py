@@ -239,13 +239,14 @@ def _segment(
         return jet(moment, left, starts, nterms - 1) * factor[:, None, None]
 
     ncells, nterms = taylor_cells(lambda s, order: jet(moment, left, s, order), duration)
-    per = _samples_per_cell(samples, duration, duration / ncells)
+    fewest = _CROSSOVER if len(a) == 1 else 1  # the series are evaluated system by system
+    per = _samples_per_cell(samples, duration, duration / ncells, fewest)
     if per:
         h = per * float(samples[-1] - samples[0]) / (samples.size - 1)
         changes = changes_over(h * a, h * b, nterms, halvings=per.bit_length() - 1)
-        while per >= _CROSSOVER and not np.isfinite(changes[-1]).all():  # an unstable system overflows within a cell
+        while per >= fewest and not np.isfinite(changes[-1]).all():  # an unstable system overflows within a cell
             changes, per, h = changes[:-1], per // 2, 0.5 * h
-        if per >= _CROSSOVER:
+        if per >= fewest:
             return _even_segment(a, b, series, duration, nterms, per, h, changes, samples, state, read, out)
     h = duration / ncells
     terms = series(h * np.arange(ncells, dtype=float), h)
@@ -361,14 +362,14 @@ def taylor_cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[i
     return ncells, min(_TERMS, int(np.flatnonzero(size.any(axis=1)).max(initial=0)) + 1)
 
 
-def _samples_per_cell(samples: Array, duration: float, longest: float) -> int:
+def _samples_per_cell(samples: Array, duration: float, longest: float, fewest: int) -> int:
     """Number of evenly spaced samples per cell, a power of two; 0 if they are uneven or too few."""
     step = spacing(samples, duration) if samples.size >= 32 else 0.0
-    if not step or max(samples[0], duration - samples[-1]) > step:
+    if not step or max(samples[0], duration - samples[-1]) > 1.001 * step:  # a whole step, up to rounding
         return 0
     # Above the square root of the number of samples the table is more expensive than the propagation.
     maximum = min(longest / step - 1.0, 2.0 * samples.size**0.5)
-    return 2 ** int(np.log2(maximum)) if maximum >= _CROSSOVER else 0
+    return 2 ** int(np.log2(maximum)) if maximum >= fewest else 0
 
 
 def spacing(samples: Array, duration: float) -> float:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Mapping
+from functools import reduce
 
 import control as ct
 import numpy as np
@@ -34,9 +34,11 @@ NUMBERED = {
     "trigonometric": {1.0: (26, 4), 5.0: (30, 0), 20.0: (44, 22), 100.0: (-14, 12), 1000.0: (34, 20)},
 }
 """Gains marked in figure 1, with the offsets of their labels [pt]; of two plans only, so that labels do not overlap."""
+BAND = 0.02
+"""Half width of the settling band, relative to the move."""
 SWEPT = ("settling_time", "overshoot_error", "control_peak", "control_effort")
 FED = "trigonometric, feedforward"
-STEP_LIMIT = (-np.log(0.02) / 0.5, 100.0)
+STEP_LIMIT = (-np.log(BAND) / 0.5, 100.0)
 """Limit of settling time [s] and overshoot [%] of the step response for infinite gain."""
 
 
@@ -57,8 +59,9 @@ def linear_study(progress: bool = True, count: int = 121, finest: float = 1e-3) 
     progress : bool, optional
         Show a bar on stderr.
     count : int, optional
-        Gains before refinement: as many evenly spaced in their square root, the
-        frequency of the loop, and half as many in their logarithm.
+        Gains from whose loops jumps of settling times are predicted: as many evenly
+        spaced in their square root, the frequency of the loop, and half as many in
+        their logarithm. The latter are swept, with gains around the jumps.
     finest : float, optional
         Relative spacing of gains to which jumps of a settling time are located.
 
@@ -140,19 +143,23 @@ def _loop(gain: float) -> ct.StateSpace:
 def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
     """Sweep over the gain, refined between gains where a settling time jumps, or changes steeply.
 
-    Jumps after the move are known before the sweep; it finds the others.
+    Most jumps are known before the sweep; it finds the others.
     """
-    built = lru_cache(maxsize=None)(_loop)
 
     def swept(gains: Array) -> Sweep:
-        found = sweep(built, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", measures=SWEPT)
+        return reduce(Sweep.merged, (sampled(gains, every) for every in np.unique(_strides(gains)).tolist()))
+
+    def sampled(gains: Array, every: int) -> Sweep:
+        own = gains[_strides(gains) == every]
+        times = TIMEPTS[::every]
+        found = sweep(_loop, own, linear_plans(), times, progress=progress, parameter="gain", measures=SWEPT)
         if found.interrupted:  # an incomplete sweep is not a result
             raise KeyboardInterrupt
         return found
 
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
-    gains = np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 2)), list(NUMBERED["step"]))
-    found = swept(np.union1d(gains, _around_jumps(gains, [built(gain) for gain in gains.tolist()], finest)))
+    gains = np.union1d(np.geomspace(*GAINS, count // 2), list(NUMBERED["step"]))
+    found = swept(np.union1d(gains, _around_jumps(np.union1d(even, gains), finest)))
     while True:
         settling = [rows["settling_time"] for rows in found.metrics.values()]
         jump, steep = (np.any([settling_jumps(found.values, r, s) for r in settling], axis=0) for s in (3.0, 1.5))
@@ -161,6 +168,16 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
         if parts.max() == 1:
             return found
         found = found.merged(swept(np.setdiff1d(_divided(found.values, parts), found.values)))
+
+
+def _strides(gains: Array) -> NDArray[np.intp]:
+    """Intervals between samples of the sweep, in those of `TIMEPTS`: 1, 2 or 4.
+
+    The loop oscillates with the square root of the gain: a gain of a fourth has as many
+    samples in a period at half of the times. Metrics are then as accurate as at the
+    highest gain, to 2e-6 of their value.
+    """
+    return 2 ** np.clip(np.floor(0.5 * np.log2(GAINS[1] / gains)), 0.0, 2.0).astype(np.intp)
 
 
 def _parts(gains: Array, widest: ArrayLike) -> NDArray[np.intp]:
@@ -175,8 +192,8 @@ def _divided(gains: Array, parts: NDArray[np.intp]) -> Array:
     return np.append(gains[left] * (gains[left + 1] / gains[left]) ** part, gains[-1])
 
 
-def _around_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -> Array:
-    """Gains on both sides of the jumps of settling times after the move, on a subdivision of given gains and loops.
+def _around_jumps(gains: Array, finest: float) -> Array:
+    """Gains on both sides of the jumps of settling times, on a subdivision of gains from whose loops they are predicted.
 
     They enclose a jump to `finest`. One more gain is up to 24 times as far on the side
     where the extremum is outside of the band: there the curve begins like a square root.
@@ -185,8 +202,15 @@ def _around_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -
     fine, ends = _divided(gains, parts), np.cumsum(parts)
     around = []
     for plan in linear_plans().values():
-        after = CubicSpline(np.sqrt(gains), _after_move(loops, plan))(np.sqrt(fine))  # analytic functions of the gain
-        change = np.diff(np.floor(_last_extremum_outside(*after.T)))
+        errors, after = _errors(gains, plan)
+        # Both are analytic functions of the square root of the gain.
+        extremum, inside = _last_extremum_outside(*CubicSpline(np.sqrt(gains), after)(np.sqrt(fine)).T)
+        close = np.repeat(settling_jumps(gains, _last_outside(errors), 1.5), parts)
+        where = np.flatnonzero(inside & (np.append(close, False) | np.append(False, close)))
+        last = np.full(fine.size, np.nan)
+        last[where] = _last_outside(CubicSpline(np.sqrt(gains), errors)(np.sqrt(fine[where])))
+        during, later = np.diff(last), np.diff(np.floor(extremum))
+        change = np.where(np.abs(during) > 1.0, during, np.where(inside[1:] & inside[:-1], 0.0, later))
         jump = np.flatnonzero(np.abs(change) > 0.0)
         where = np.searchsorted(ends, jump, side="right")
         first, last = ends[where] - parts[where], ends[where]
@@ -195,30 +219,50 @@ def _around_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -
     return np.concatenate(around)
 
 
-def _after_move(loops: Sequence[ct.StateSpace], plan: Trajectory) -> Array:
-    """Error and its derivative at the end of the move; sum and product of the poles, shape (nloops, 4)."""
-    a, b, c = (np.array([getattr(loop, name) for loop in loops]) for name in "ABC")
-    rest = np.linalg.solve(a, -b)[..., 0]
-    times = np.linspace(WAYPOINTS[0].time, WAYPOINTS[-1].time, 65)
-    states = exact_states(a, b, plan.segment_jet_at, list(plan.breakpoints), times, 0.0 * rest)
-    error = (states[..., -1] - rest)[..., None]
-    rows = [c[:, :1] @ error, c[:, :1] @ a @ error]
-    return np.column_stack([row.ravel() for row in rows] + [np.trace(a, axis1=1, axis2=2), np.linalg.det(a)])
+def _errors(gains: Array, plan: Trajectory) -> tuple[Array, Array]:
+    """Difference from the final value during the move, and the free motion after it.
+
+    Returns
+    -------
+    ndarray, shape (ngains, 257)
+        Difference of the output from its final value at even times of the move.
+    ndarray, shape (ngains, 4)
+        This at the end of the move, and its derivative; sum and product of the poles.
+    """
+    ends = [_loop(gain) for gain in (0.0, 1.0)]
+    zero, one = ([np.asarray(getattr(loop, name)) for name in "ABC"] for loop in ends)
+    # The matrices of the loop are affine functions of its gain.
+    a, b, c = (m + gains[:, None, None] * (n - m) for m, n in zip(zero, one, strict=True))
+    read = np.concatenate([c[:, :1], c[:, :1] @ a], axis=1)
+    times = np.linspace(WAYPOINTS[0].time, WAYPOINTS[-1].time, 257)
+    rest = np.linalg.solve(a, -b)
+    states = exact_states(a, b, plan.segment_jet_at, list(plan.breakpoints), times, 0.0 * rest[..., 0], read)
+    errors = states - read @ rest
+    return errors[:, 0], np.column_stack([errors[..., -1], np.trace(a, axis1=1, axis2=2), np.linalg.det(a)])
 
 
-def _last_extremum_outside(error: Array, slope: Array, total: Array, product: Array) -> Array:
+def _last_outside(errors: Array) -> Array:
+    """Number of samples up to the last one outside of the settling band, for each row."""
+    return errors.shape[1] - np.argmax(np.abs(errors[:, ::-1]) > BAND, axis=1).astype(float)
+
+
+def _last_extremum_outside(
+    error: Array, slope: Array, total: Array, product: Array
+) -> tuple[Array, NDArray[np.bool_]]:
     """Number of the last extremum outside of the settling band after the move, for increasing gains.
 
     Continued to real numbers: the settling time jumps where it passes an integer.
-    nan if all extrema are inside. Arguments as by `_after_move`.
+    nan if all extrema are inside. Arguments as by `_errors`. Second, whether there is
+    no such extremum after the end of the move.
     """
     # The error is Re(size exp(pole t)), with extrema where Re(pole size exp(pole t)) = 0.
     pole = 0.5 * total + 1j * np.sqrt(np.maximum(product - 0.25 * total**2, 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):  # at the double pole
         size = error - 1j * (slope - pole.real * error) / pole.imag
-        time = np.log(0.02 * np.abs(pole) / (np.abs(size) * pole.imag)) / pole.real
-        number = (np.unwrap(np.nan_to_num(np.angle(pole * size))) + pole.imag * time) / np.pi - 0.5
-    return np.where(time > 0.0, number, np.nan)
+        time = np.log(BAND * np.abs(pole) / (np.abs(size) * pole.imag)) / pole.real
+        angle = np.unwrap(np.nan_to_num(np.angle(pole * size)))
+        number = np.where(time > 0.0, (angle + pole.imag * time) / np.pi - 0.5, np.nan)
+        return number, ~((np.floor(number) + 0.5) * np.pi >= angle)
 
 
 def _notes(comparison: Comparison, swept: Sweep) -> list[str]:
