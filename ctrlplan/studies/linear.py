@@ -206,30 +206,40 @@ def _divided(gains: Array, parts: NDArray[np.intp]) -> Array:
 
 
 def _around_jumps(gains: Array, finest: float) -> Array:
-    """Gains on both sides of the jumps of settling times, on a subdivision of gains from whose loops they are predicted.
+    """Gains on both sides of the jumps of settling times, on a subdivision of gains.
 
-    They enclose a jump to `finest`. One more gain is up to 24 times as far on the side
-    where the extremum is outside of the band: there the curve begins like a square root.
+    The jumps are predicted from the loops of these gains, and enclosed to `finest`. One
+    more gain is up to 24 times as far on the side where the extremum is outside of the
+    band: there the curve begins like a square root.
     """
     parts = _parts(gains, finest)
     fine, ends = _divided(gains, parts), np.cumsum(parts)
     around = []
     for plan in linear_plans().values():
-        errors, after = _errors(gains, plan)
-        # Both are analytic functions of the square root of the gain.
-        extremum, inside = _last_extremum_outside(*CubicSpline(np.sqrt(gains), after)(np.sqrt(fine)).T)
-        close = np.repeat(settling_jumps(gains, _last_outside(errors), 1.5), parts)
-        where = np.flatnonzero(inside & (np.append(close, False) | np.append(False, close)))
-        last = np.full(fine.size, np.nan)
-        last[where] = _last_outside(CubicSpline(np.sqrt(gains), errors)(np.sqrt(fine[where])))
-        during, later = np.diff(last), np.diff(np.floor(extremum))
-        change = np.where(np.abs(during) > 1.0, during, np.where(inside[1:] & inside[:-1], 0.0, later))
-        jump = np.flatnonzero(np.abs(change) > 0.0)
+        change = _changes(gains, fine, parts, plan)
+        jump = np.flatnonzero(change)
         where = np.searchsorted(ends, jump, side="right")
-        first, last = ends[where] - parts[where], ends[where]
-        far = np.clip(np.where(change[jump] > 0.0, jump + 24, jump - 23), first, last)
+        far = np.clip(np.where(change[jump] > 0.0, jump + 24, jump - 23), ends[where] - parts[where], ends[where])
         around += [fine[jump], fine[jump + 1], fine[far]]
     return np.concatenate(around)
+
+
+def _changes(gains: Array, fine: Array, parts: NDArray[np.intp], plan: Trajectory) -> Array:
+    """Changes of the last extremum outside of the settling band between neighbours of `fine`; 0 where it is the same.
+
+    By interpolation from the loops of `gains`, whose intervals are divided into `parts`.
+    """
+    errors, free = _errors(gains, plan)
+    frequency = np.sqrt(gains), np.sqrt(fine)  # errors are analytic functions of it
+    extremum, ended = _last_extremum_outside(*CubicSpline(frequency[0], free)(frequency[1]).T)
+    after = np.nan_to_num(np.diff(np.floor(extremum)))
+    # During the move: by the last sample outside, between gains where it changes by more than it does with an extremum.
+    changed = np.repeat(settling_jumps(gains, _last_outside(errors), 1.5), parts)
+    some = np.flatnonzero(ended & (np.append(changed, False) | np.append(False, changed)))
+    last = np.full(fine.size, np.nan)
+    last[some] = _last_outside(CubicSpline(frequency[0], errors)(frequency[1][some]))
+    during = np.diff(last)
+    return np.where(ended[1:] & ended[:-1], np.where(np.abs(during) > 1.0, during, 0.0), after)
 
 
 def _errors(gains: Array, plan: Trajectory) -> tuple[Array, Array]:
@@ -245,7 +255,7 @@ def _errors(gains: Array, plan: Trajectory) -> tuple[Array, Array]:
     a, b, c, _ = (zero + gains[:, None, None] * slope for zero, slope in _matrices())
     read = np.concatenate([c[:, :1], c[:, :1] @ a], axis=1)
     times = np.linspace(WAYPOINTS[0].time, WAYPOINTS[-1].time, 257)
-    rest = np.linalg.solve(a, -b)
+    rest = np.asarray(np.linalg.solve(a, -b), dtype=float)
     states = exact_states(a, b, plan.segment_jet_at, list(plan.breakpoints), times, 0.0 * rest[..., 0], read)
     errors = states - read @ rest
     return errors[:, 0], np.column_stack([errors[..., -1], np.trace(a, axis1=1, axis2=2), np.linalg.det(a)])
@@ -260,8 +270,8 @@ def _last_extremum_outside(error: Array, slope: Array, total: Array, product: Ar
     """Number of the last extremum outside of the settling band after the move, for increasing gains.
 
     Continued to real numbers: the settling time jumps where it passes an integer.
-    nan if all extrema are inside. Arguments as by `_errors`. Second, whether there is
-    no such extremum after the end of the move.
+    nan if all extrema are inside. Second, whether there is no extremum outside after
+    the end of the move. Arguments as by `_errors`.
     """
     # The error is Re(size exp(pole t)), with extrema where Re(pole size exp(pole t)) = 0.
     pole = 0.5 * total + 1j * np.sqrt(np.maximum(product - 0.25 * total**2, 0.0))
