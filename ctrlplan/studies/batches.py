@@ -19,7 +19,7 @@ R = TypeVar("R")
 _SAMPLES = 2**19
 """Maximum number of samples of a signal over all loops that are solved together."""
 
-FIRST = 4
+FIRST = 16
 """Number of loops solved together at first; fourfold each time, so that an interruption discards few results."""
 
 FIRST_OF_TASK = 32

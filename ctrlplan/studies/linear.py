@@ -7,9 +7,9 @@ from functools import lru_cache, reduce
 
 import control as ct
 import numpy as np
+from numpy.polynomial import Chebyshev
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
-from scipy.optimize import minimize_scalar
 
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.studies.benefit import benefit
@@ -34,6 +34,8 @@ NUMBERED = {
     "trigonometric": {1.0: (26, 4), 5.0: (30, 0), 20.0: (44, 22), 100.0: (-14, 12), 1000.0: (34, 20)},
 }
 """Gains marked in figure 1, with the offsets of their labels [pt]; of two plans only, so that labels do not overlap."""
+DENSE = 30.0
+"""Gain above which those around the jumps are dense enough for curves."""
 BAND = 0.02
 """Half width of the settling band, relative to the move."""
 SWEPT = ("settling_time", "overshoot_error", "control_peak", "control_effort")
@@ -61,7 +63,8 @@ def linear_study(progress: bool = True, count: int = 121, finest: float = 1e-3) 
     count : int, optional
         Gains from whose loops jumps of settling times are predicted: as many evenly
         spaced in their square root, the frequency of the loop, and half as many in
-        their logarithm. The latter are swept, with gains around the jumps.
+        their logarithm. Of the latter, those below 30 are swept, with gains around the
+        jumps.
     finest : float, optional
         Relative spacing of gains to which jumps of a settling time are located.
 
@@ -158,29 +161,32 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
 
     Most jumps are known before the sweep; it finds the others.
     """
-
-    def swept(gains: Array) -> Sweep:
-        return reduce(Sweep.merged, (sampled(gains, every) for every in np.unique(_strides(gains)).tolist()))
-
-    def sampled(gains: Array, every: int) -> Sweep:
-        own = gains[_strides(gains) == every]
-        times = TIMEPTS[::every]
-        found = sweep(_swept_loop, own, linear_plans(), times, progress=progress, parameter="gain", measures=SWEPT)
-        if found.interrupted:  # an incomplete sweep is not a result
-            raise KeyboardInterrupt
-        return found
-
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
-    gains = np.union1d(np.geomspace(*GAINS, count // 2), list(NUMBERED["step"]))
-    found = swept(np.union1d(gains, _around_jumps(np.union1d(even, gains), finest)))
+    base = np.union1d(np.geomspace(*GAINS, count // 2), list(NUMBERED["step"]))
+    own = np.union1d(base[base < DENSE], [*NUMBERED["step"], GAINS[1]])
+    gains = np.union1d(own, _around_jumps(np.union1d(even, base), finest))
+    every = _strides(gains)
+    plans = linear_plans()
+    groups = [(gains[every == k], k) for k in np.unique(every).tolist()]
+    found = reduce(Sweep.merged, (_swept(some, plans, SWEPT, k, progress) for some, k in groups))
     while True:
         settling = [rows["settling_time"] for rows in found.metrics.values()]
         jump, steep = (np.any([settling_jumps(found.values, r, s) for r in settling], axis=0) for s in (3.0, 1.5))
         widest = np.select([jump, steep], [finest, max(finest, 0.02)], np.inf)
-        parts = np.minimum(_parts(found.values, widest), 8)
+        parts = np.minimum(_parts(found.values, widest), 16)
         if parts.max() == 1:
             return found
-        found = found.merged(swept(np.setdiff1d(_divided(found.values, parts), found.values)))
+        gains = np.setdiff1d(_divided(found.values, parts), found.values)
+        found = found.merged(_swept(gains, plans, SWEPT, int(_strides(gains).min()), progress))
+
+
+def _swept(gains: Array, plans: dict[str, Trajectory], measures: tuple[str, ...], every: int, progress: bool) -> Sweep:
+    """Metrics at gains, from every so many of the sample times."""
+    times = TIMEPTS[::every]
+    found = sweep(_swept_loop, gains, plans, times, progress=progress, parameter="gain", measures=measures)
+    if found.interrupted:  # an incomplete sweep is not a result
+        raise KeyboardInterrupt
+    return found
 
 
 def _strides(gains: Array) -> NDArray[np.intp]:
@@ -188,7 +194,7 @@ def _strides(gains: Array) -> NDArray[np.intp]:
 
     The loop oscillates with the square root of the gain: a gain of a fourth has as many
     samples in a period at half of the times. Metrics are then as accurate as at the
-    highest gain, to 2e-6 of their value.
+    highest gain, to a few 1e-6 of their value.
     """
     return 2 ** np.clip(np.floor(0.5 * np.log2(GAINS[1] / gains)), 0.0, 2.0).astype(np.intp)
 
@@ -330,14 +336,23 @@ def overshoot_peak(gains: Array, overshoot: Array) -> tuple[float, float]:
     """Gain at which the overshoot of the trigonometric plan peaks, and the peak [%], between the gains swept."""
     plan = linear_plans()["trigonometric"]
 
-    def overshoot_at(log_gain: float) -> float:
-        found = compare(_loop(float(np.exp(log_gain))), {"it": plan}, TIMEPTS, measures=("overshoot_error",))
-        return -found.metrics["it"]["overshoot_error"]
+    def overshoot_at(frequency: Array) -> Array:
+        found = _swept(frequency**2, {"it": plan}, ("overshoot_error",), int(_strides(frequency**2).min()), False)
+        return found.metrics["it"]["overshoot_error"]
 
-    top = int(np.argmax(overshoot))
-    around = np.log(gains[[max(top - 1, 0), min(top + 1, gains.size - 1)]])
-    best = minimize_scalar(overshoot_at, bounds=tuple(around.tolist()), method="bounded", options={"xatol": 1e-5})
-    return float(np.exp(best.x)), -float(best.fun)
+    frequency, values = np.sqrt(gains), overshoot
+    while True:
+        top = int(np.argmax(values))
+        low, high = frequency[[max(top - 1, 0), min(top + 1, frequency.size - 1)]].tolist()
+        if high - low < 0.25:  # a smooth function there
+            break
+        frequency = np.linspace(low, high, 9)
+        values = overshoot_at(frequency)
+    curve = Chebyshev.interpolate(overshoot_at, 8, domain=[low, high])
+    level = curve.deriv().roots()
+    found = [low, high, *level.real[(level.imag == 0.0) & (level.real > low) & (level.real < high)].tolist()]
+    best = max(found, key=curve)
+    return float(best**2), float(curve(best))
 
 
 def _shares(gains: Array, where: NDArray[np.bool_]) -> str:
