@@ -20,7 +20,7 @@ overflow are infinite, and so is what depends on them; others stay finite.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from functools import lru_cache, reduce
 from itertools import repeat
@@ -31,28 +31,22 @@ from numpy.typing import NDArray
 from scipy.linalg import matrix_balance, pascal
 
 from ctrlplan._types import Array
+from ctrlplan.simulation.analytic_segments import TERMS, AnalyticSegment, Jet, spacing
 from ctrlplan.simulation.exponential import MANY_STATES, changes_of_many
 from ctrlplan.simulation.pairs import pair_product, pair_sum
-
-_TERMS = 18
-"""Number of Taylor terms of the input in a cell."""
 
 _CROSSOVER = 8
 """Number of samples in a cell above which a table for all cells is faster than a series in each; and number of states
 up to which products of step matrices are faster than single steps."""
 
 _POWERS = 5
-"""Number of further powers of a matrix with a computed norm: p (p - 1) <= _TERMS + 2."""
+"""Number of further powers of a matrix with a computed norm: p (p - 1) <= TERMS + 2."""
 
 _CANCELLED = 16.0
 """Ratio of the terms of a matrix product to its result above which it is computed in twice the digits or avoided."""
 
 _NUMBERS = 2**17
 """Maximum number of entries in an array of exponentials with one for each spacing."""
-
-Jet = Callable[[float, float, Array, int], Array]
-"""(moment, origin, s, order) -> derivatives (order + 1, ninputs, ntime) at origin + s
-of the analytic functions that are valid at `moment`."""
 
 
 def exact_states(
@@ -94,12 +88,16 @@ def exact_states(
     if not scale.size:
         return out
     first, last = float(timepts[0]), float(timepts[-1])
-    inner = sorted({float(t) for t in breakpoints if first < t < last})
+    ends = [first, *sorted({float(t) for t in breakpoints if first < t < last}), last]
+    places = [*np.searchsorted(timepts, ends[:-1]).tolist(), timepts.size]
     with np.errstate(all="ignore"):
-        for left, right in zip([first, *inner], [*inner, last], strict=True):
-            begin, end = np.searchsorted(timepts, [left, right], side="left")
-            end += right == last
-            state = _segment(a, b, jet, left, right, timepts[begin:end] - left, state, read, out[:, :, begin:end])
+        segments = [
+            AnalyticSegment.of(jet, left, right, timepts[begin:end] - left, _CROSSOVER if len(a) == 1 else 1)
+            for left, right, begin, end in zip(ends[:-1], ends[1:], places[:-1], places[1:], strict=True)
+        ]
+        changes = _changes(a, b, segments)
+        for segment, own, begin, end in zip(segments, changes, places[:-1], places[1:], strict=True):
+            state = _followed_segment(a, b, segment, own, state, read, out[:, :, begin:end])
     return out
 
 
@@ -219,75 +217,65 @@ def _balanced(a: Array, b: Array, initial: Array, scale: Array | None = None) ->
     return scale, a * (scale / scale[:, None]), b / scale[:, None], initial / scale
 
 
-def _segment(
-    a: Array,
-    b: Array,
-    jet: Jet,
-    left: float,
-    right: float,
-    samples: Array,
-    state: Array,
-    read: Array,
-    out: Array,
+_Changes = dict[float, list[Array]]
+"""`changes_over` a whole cell (1), and parts of a cell, in cells."""
+
+
+def _changes(a: Array, b: Array, segments: Sequence[AnalyticSegment]) -> list[_Changes]:
+    """Changes of states in each segment with evenly spaced samples.
+
+    Few states are computed in one call: then the number of calls is what takes time.
+    """
+    wanted = [(k, s, part) for k, s in enumerate(segments) if s.per for part in {1.0, s.first, s.rest or 0.0} - {0.0}]
+    found: list[_Changes] = [{} for _ in segments]
+    (count, n), m = a.shape[:2], b.shape[2]
+    for group in [wanted] if wanted and count * n <= _CROSSOVER else [[one] for one in wanted]:
+        times = np.array([part * s.h for _, s, part in group])[:, None, None, None]
+        nterms = max(s.nterms for _, s, _ in group)
+        halvings = max(s.per.bit_length() - 1 if part == 1.0 else 0 for _, s, part in group)
+        flat = (times * a).reshape(-1, n, n), (times * b).reshape(-1, n, m)
+        levels = [level.reshape(len(group), count, n, -1) for level in changes_over(*flat, nterms, halvings)]
+        for i, (k, s, part) in enumerate(group):
+            found[k][part] = [level[i, ..., : n + s.nterms * m] for level in levels]
+    return found
+
+
+def _followed_segment(
+    a: Array, b: Array, segment: AnalyticSegment, changes: _Changes, state: Array, read: Array, out: Array
 ) -> Array:
-    """Compute outputs at the samples (times since `left`) of an analytic segment; return the states at its end."""
-    moment, duration = 0.5 * (left + right), right - left
-
-    def series(starts: Array, h: float) -> Array:
-        """Taylor terms (nterms, ninputs, ncells) at the starts of the cells, in units of h."""
-        factor = h ** np.arange(nterms, dtype=float) / _FACTORIALS[:nterms]
-        return jet(moment, left, starts, nterms - 1) * factor[:, None, None]
-
-    ncells, nterms = taylor_cells(lambda s, order: jet(moment, left, s, order), duration)
-    per = _samples_per_cell(samples, duration, duration / ncells)
-    if per:
-        h = per * float(samples[-1] - samples[0]) / (samples.size - 1)
-        changes = changes_over(h * a, h * b, nterms, halvings=per.bit_length() - 1)
-        while per >= _CROSSOVER and not np.isfinite(changes[-1]).all():  # an unstable system overflows within a cell
-            changes, per, h = changes[:-1], per // 2, 0.5 * h
-        if per >= _CROSSOVER:
-            return _even_segment(a, b, series, duration, nterms, per, h, changes, samples, state, read, out)
-    h = duration / ncells
-    terms = series(h * np.arange(ncells, dtype=float), h)
+    """Compute outputs at the samples of a segment; return the states at its end."""
+    while segment.per and not np.isfinite(changes[1.0][-1]).all():  # an unstable system overflows within a cell
+        segment = segment.shorter()
+        (changes,) = _changes(a, b, [segment])
+    if segment.per:
+        return _even_segment(segment, changes, state, read, out)
+    h = segment.h
+    terms = segment.series(round(segment.duration / h))
     ends = np.empty_like(state)
     for i in range(len(a)):
-        values, ends[i] = _any_segment(h * a[i], h * b[i], terms, samples / h, state[i])
+        values, ends[i] = _any_segment(h * a[i], h * b[i], terms, segment.samples / h, state[i])
         out[i] = matrix_product(read[i], values)
     return ends
 
 
-def _even_segment(
-    a: Array,
-    b: Array,
-    series: Callable[[Array, float], Array],
-    duration: float,
-    nterms: int,
-    per: int,
-    h: float,
-    changes: list[Array],
-    samples: Array,
-    state: Array,
-    read: Array,
-    out: Array,
-) -> Array:
-    """The same for evenly spaced samples, `per` (a power of two) in each cell of length h."""
-    (count, n), m = state.shape, b.shape[-1]
-    whole, remainder = divmod(samples.size, per)
-    last = int(duration // h)  # the cell in which the segment ends
-    cells = series(h * np.arange(max(last, whole) + 1, dtype=float), h)
+def _even_segment(segment: AnalyticSegment, changes: _Changes, state: Array, read: Array, out: Array) -> Array:
+    """The same for evenly spaced samples."""
+    (count, n), per, last = state.shape, segment.per, segment.last
+    whole, remainder = divmod(segment.samples.size, per)
+    cells = segment.series(max(last, whole) + 1)
+    nterms, m = cells.shape[:2]
     chain = cells.reshape(-1, cells.shape[2])
     known = np.empty((count, cells.shape[2], n + len(chain)))
-    known[:, :, :n] = _marched(state, changes, cells[:, :, :-1]).swapaxes(1, 2)
+    known[:, :, :n] = _marched(state, changes[1.0], cells[:, :, :-1]).swapaxes(1, 2)
     known[:, :, n:] = chain.T
 
     table = np.zeros((count, n, per, known.shape[2]))  # from the start of a cell to its samples
-    if samples[0]:
-        table[:, :, 0] = _part(a, b, nterms, h, samples[0] / h)
+    if segment.first:
+        table[:, :, 0] = _in_cell(changes[segment.first][-1], segment.first, nterms, m)
     have = 1
-    for change in changes[-per.bit_length() : -1]:
+    for change in changes[1.0][-per.bit_length() : -1]:
         time = have / per
-        powers = np.repeat(time ** np.arange(nterms), m)
-        step = np.concatenate([change[..., :n], change[..., n:] * powers], axis=-1)
+        step = _in_cell(change, time, nterms, m)
         table[:, :, have : 2 * have] = _followed(table[:, :, :have], step, _shift(nterms, m, time))
         have *= 2
     rows = (read @ table.reshape(count, n, -1)).reshape(count, -1, *table.shape[2:]).swapaxes(2, 3)
@@ -298,19 +286,19 @@ def _even_segment(
     for i in _overflowed(out):
         main[i] = matrix_product(known[i, :whole], rows[i])
         out[i, :, whole * per :] = matrix_product(known[i, whole : whole + 1], rows[i, ..., :remainder])[:, 0]
-    if samples[-1] == duration:
+    if segment.rest is None:
         ending, last = table[:, :, remainder - 1], whole if remainder else whole - 1
+    elif segment.rest:
+        ending = _in_cell(changes[segment.rest][-1], segment.rest, nterms, m)
     else:
-        ending = _part(a, b, nterms, h, duration / h - last)
+        return known[:, last, :n]
     return known[:, last, :n] + matrix_product(ending, known[:, last, :, None])[:, :, 0]
 
 
-def _part(a: Array, b: Array, nterms: int, h: float, part: float) -> Array:
-    """Change of states over a fraction of a cell, from states and the input terms of the whole cell."""
-    n, powers = a.shape[-1], np.repeat(part ** np.arange(nterms), b.shape[-1])
-    change: Array = changes_over(part * h * a, part * h * b, nterms)[-1]
-    change[..., n:] *= powers
-    return change
+def _in_cell(change: Array, part: float, nterms: int, m: int) -> Array:
+    """Change over a part of a cell from the input terms of the whole cell."""
+    n = change.shape[-2]
+    return np.concatenate([change[..., :n], change[..., n:] * np.repeat(part ** np.arange(nterms), m)], axis=-1)
 
 
 def _any_segment(a: Array, b: Array, series: Array, samples: Array, state: Array) -> tuple[Array, Array]:
@@ -340,44 +328,6 @@ def _any_segment(a: Array, b: Array, series: Array, samples: Array, state: Array
     found = _evaluated(_taylor(h * a, h * b, states, series), where, sigma) if sigma.any() else states[:, where]
     found[:, ending] = end[:, None]
     return found, end
-
-
-def taylor_cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[int, int]:
-    """Number of cells in which the Taylor series of the input converges, and of its terms."""
-    order = _TERMS + 7
-    size = np.abs(jet(np.linspace(0.0, duration, 9), order)).max(axis=2)  # (order + 1, ninputs)
-    if not np.isfinite(size[:_TERMS]).all():
-        raise ValueError(
-            f"derivatives of inputs up to order {_TERMS - 1} must not overflow, got an overflow on a segment of "
-            f"{duration:g} s; use other units for times or values"
-        )
-    ncells = 1
-    while ncells < 4096:
-        terms = size * ((duration / ncells) ** np.arange(order + 1) / _LONG_FACTORIALS)[:, None]
-        # Terms larger than the input itself would cancel with loss of digits.
-        if np.all(terms[_TERMS:] <= 1e-17 * terms.max(axis=0)) and np.all(terms.sum(axis=0) <= 8.0 * terms[0]):
-            break
-        ncells *= 2
-    return ncells, min(_TERMS, int(np.flatnonzero(size.any(axis=1)).max(initial=0)) + 1)
-
-
-def _samples_per_cell(samples: Array, duration: float, longest: float) -> int:
-    """Number of evenly spaced samples per cell, a power of two; 0 if they are uneven or too few."""
-    step = spacing(samples, duration) if samples.size >= 32 else 0.0
-    if not step or max(samples[0], duration - samples[-1]) > step:
-        return 0
-    # Above the square root of the number of samples the table is more expensive than the propagation.
-    maximum = min(longest / step - 1.0, 2.0 * samples.size**0.5)
-    return 2 ** int(np.log2(maximum)) if maximum >= _CROSSOVER else 0
-
-
-def spacing(samples: Array, duration: float) -> float:
-    """Spacing of evenly spaced samples, up to rounding of times in the segment; 0 if they are uneven."""
-    if samples.size < 2:
-        return 0.0
-    step = float(samples[-1] - samples[0]) / (samples.size - 1)
-    deviation = np.abs(samples - (samples[0] + step * np.arange(samples.size)))
-    return step if deviation.max() <= 4.0 * np.finfo(float).eps * duration else 0.0
 
 
 def changes_over(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
@@ -427,7 +377,7 @@ def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
     halvings = np.ceil(np.log2(np.maximum(norm, 1.0)))
     n = a.shape[1]
     both = np.concatenate([a, b], axis=2) * 0.5 ** halvings[:, None, None]
-    products = np.empty((_TERMS + 1, *both.shape))
+    products = np.empty((TERMS + 1, *both.shape))
     products[0] = both
     for k in range(_POWERS):
         np.matmul(both[..., :n], products[k], out=products[k + 1])
@@ -441,7 +391,7 @@ def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
         halvings, factor = halvings - saved, 2.0 ** saved[:, None, None]
         for k in range(_POWERS + 1):
             products[k] *= factor ** (k + 1.0)
-    for k in range(_POWERS, _TERMS):
+    for k in range(_POWERS, TERMS):
         np.matmul(products[0, ..., :n], products[k], out=products[k + 1])
     return products, halvings.astype(np.intp)
 
@@ -482,7 +432,7 @@ def _doubled_precisely(both: Array, minimum: NDArray[np.intp], nterms: int, leve
     """The same as `_doubled` in double-double arithmetic, from [a, b] over a time of 2^-minimum."""
     n, m = both.shape[1], both.shape[2] - both.shape[1]
     powers = np.concatenate([np.ones(n), np.repeat(0.5 ** np.arange(nterms), m)])
-    shift, orders = _shift(nterms, m, 1.0), np.arange(1.0, _TERMS + 2.0)
+    shift, orders = _shift(nterms, m, 1.0), np.arange(1.0, TERMS + 2.0)
     products = [(both, np.zeros_like(both))]
     while len(products) < orders.size:
         products.append(pair_product((both[..., :n], np.zeros_like(both[..., :n])), products[-1]))
@@ -649,7 +599,7 @@ def _halved(series: Array) -> tuple[Array, Array]:
 def _taylor(a: Array, b: Array, states: Array, series: Array) -> list[Array]:
     """Taylor terms of the state over the shortest time of `changes_over`."""
     terms = [states]
-    for j in range(_TERMS + 1):
+    for j in range(TERMS + 1):
         following = matrix_product(a, terms[-1])
         if j < len(series):
             following = following + b @ series[j]
@@ -670,10 +620,8 @@ def _evaluated(terms: list[Array], where: NDArray[np.intp], sigma: Array) -> Arr
     return out
 
 
-_FACTORIALS = np.cumprod(np.concatenate([[1.0], np.arange(1.0, _TERMS)]))
-_LONG_FACTORIALS = np.cumprod(np.concatenate([[1.0], np.arange(1.0, _TERMS + 8)]))
-_PASCAL: Array = np.triu(pascal(_TERMS, kind="upper")).astype(float)
-_RATIOS = [[Fraction(factorial(j), factorial(i + j + 1)) for i in range(_TERMS + 1)] for j in range(_TERMS)]
+_PASCAL: Array = np.triu(pascal(TERMS, kind="upper")).astype(float)
+_RATIOS = [[Fraction(factorial(j), factorial(i + j + 1)) for i in range(TERMS + 1)] for j in range(TERMS)]
 _WEIGHTS: Array = np.array(_RATIOS, dtype=float)
 """j!/(i + j + 1)!: factor of a^i b in the change of states by Taylor term j of the input."""
 _WEIGHTS_ERROR: Array = np.array([[ratio - Fraction(float(ratio)) for ratio in row] for row in _RATIOS], dtype=float)

@@ -23,7 +23,8 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
-from ctrlplan.simulation.exact import spacing, state_scale
+from ctrlplan.simulation.analytic_segments import spacing
+from ctrlplan.simulation.exact import state_scale
 from ctrlplan.simulation.exponential import cancels, doubled, short_change
 from ctrlplan.simulation.flow_kernel import gauss_nodes, to_legendre
 from ctrlplan.simulation.recurrences import repeated

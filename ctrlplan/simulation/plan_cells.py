@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import binom
 
 from ctrlplan._types import Array
-from ctrlplan.simulation.exact import taylor_cells
+from ctrlplan.simulation.analytic_segments import taylor_cells
 from ctrlplan.trajectories import Trajectory
 
 _TERMS = 26

@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 
 from ctrlplan.studies.alike import Linear
 from ctrlplan.studies.experiment import Experiment
+from ctrlplan.studies.measures import Run
 from ctrlplan.studies.outcomes import Failed, tried
 from ctrlplan.studies.running import Builder, System
 
@@ -18,7 +19,7 @@ R = TypeVar("R")
 _SAMPLES = 2**19
 """Maximum number of samples of a signal over all loops that are solved together."""
 
-FIRST = 4
+FIRST = 16
 """Number of loops solved together at first; fourfold each time, so that an interruption discards few results."""
 
 FIRST_OF_TASK = 32
@@ -51,11 +52,16 @@ class Batches(Generic[T, R]):
     first: int = FIRST
     _checked: bool = False
 
+    def _checks(self, loop: System | Builder) -> Run:
+        """Run with the first plan."""
+        return self.experiment.simulated(loop, next(iter(self.experiment.plans)))
+
     def outcomes(self, values: Sequence[T], timeout: float | None) -> Generator[tuple[int, R | Failed], None, None]:
         """Number and outcome of each value.
 
-        The first linear loop in a process is run separately, which checks the
-        arguments for the loop. After a KeyboardInterrupt, outcomes of loops already built follow.
+        The first linear loop in a process is also simulated with the first plan, which
+        checks the arguments for the loop. After a KeyboardInterrupt, outcomes of loops
+        already built follow.
         """
         waiting: dict[int, tuple[Linear, System]] = {}
         size = self.first
@@ -80,10 +86,10 @@ class Batches(Generic[T, R]):
             for k, value in enumerate(values):
                 loop = tried(self.build, value, timeout)
                 linear = None if self.alike is None or isinstance(loop, Failed) else self.experiment.numbers_of(loop)
+                if linear is not None and not self._checked:
+                    self._checked = not isinstance(tried(self._checks, loop, timeout), Failed)
                 if linear is None or not self._checked:
-                    outcome = loop if isinstance(loop, Failed) else tried(self.alone, loop, timeout)
-                    self._checked |= linear is not None and not isinstance(outcome, Failed)
-                    yield k, outcome
+                    yield k, loop if isinstance(loop, Failed) else tried(self.alone, loop, timeout)
                     continue
                 if waiting and not linear.fits(next(iter(waiting.values()))[0]):
                     yield from together()

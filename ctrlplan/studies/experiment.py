@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,8 @@ from ctrlplan.studies.progress import each_plan
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder, run_plan
 from ctrlplan.trajectories import Trajectory, Waypoint
 from ctrlplan.trajectories.repeated import covering
+
+T = TypeVar("T")
 
 Metrics = dict[str, dict[str, float]]
 """Plan, metric, value."""
@@ -269,11 +271,18 @@ class Experiment(Displayed):
         if not is_builder(loop):
             check_has_inputs(loop)
         with shared_forms():  # loops built for the plans differ in their sources only
-            found, failures = _each(lambda name: self.run_plan(loop, name), list(self.plans))
-        metrics = {name: values for name, (_, values) in found.items()}
-        runs = {name: run for name, (run, _) in found.items()}
+            simulated, errors = _each(lambda name: self.simulated(loop, name), each_plan(list(self.plans)))
+            try:
+                metrics = dict(zip(simulated, self.metrics_of_runs(list(simulated.values())), strict=True))
+            except Exception:  # of some of the plans
+                metrics, unmeasured = _each(lambda name: self._metrics(simulated[name]), simulated)
+                errors |= unmeasured
+        failed = [name for name in self.plans if name in errors]
+        if len(failed) == len(self.plans):
+            raise errors[failed[0]]
+        runs = {name: simulated[name] for name in metrics}
         labels = {name: (*run.outputs, *run.controls) for name, run in runs.items()}
-        return Measured(metrics, runs, failures, labels=labels)
+        return Measured(metrics, runs, {name: _reason(errors[name]) for name in failed}, labels=labels)
 
     def run_plan(self, loop: System | Builder, name: str, params: Params | None = None) -> tuple[Run, dict[str, float]]:
         """Simulate a loop with one of the plans, and compute its metrics.
@@ -366,7 +375,7 @@ class Experiment(Displayed):
             for i, curves in enumerate(stored) if samples is not None else ():
                 curves[name] = dict(zip((*tracked, *acting), rows[i][:, samples], strict=True))
             y, u = np.split(rows, [len(tracked)], axis=1)
-            values = self._metrics_of_rows(SignalRecord(self.timepts, y, u, self.axes, acting, unstable), plan)
+            values = self._metrics_of_rows(SignalRecord(self.timepts, y, u, self.axes, acting, unstable), [plan])
             for metrics, own in zip(found, values, strict=True):
                 metrics[name] = own
         results: list[Measured | None] = [None] * len(alike)
@@ -376,25 +385,33 @@ class Experiment(Displayed):
         return results
 
     def metrics_of_runs(self, runs: Sequence[Run]) -> list[dict[str, float]]:
-        """Metrics of runs of one loop with one plan and different parameters; without measures of the user."""
-        first = runs[0]
-        whole = all(np.array_equal(run.t, self.timepts) for run in runs)
-        same = first.plan.naxes == len(self.axes) and all(run.controls == first.controls for run in runs)
-        if len(runs) == 1 or not whole or not same or np.count_nonzero(first.t >= self.since) < 2:
+        """Metrics of runs of one loop, with different plans or parameters."""
+        if len(runs) < 2 or self.has_own_measures or not self._alike(runs):
             return [self._metrics(run) for run in runs]
         y = np.stack([run.rows(run.outputs) for run in runs])
         u = np.stack([run.rows(run.controls) for run in runs])
         unstable = np.array([run.is_unstable for run in runs])
         held = tuple(run.held_parts for run in runs)
-        record = SignalRecord(first.t, y, u, self.axes, first.controls, unstable, held)
-        return self._metrics_of_rows(record, first.plan)
+        record = SignalRecord(runs[0].t, y, u, self.axes, runs[0].controls, unstable, held)
+        plans = [run.plan for run in runs]
+        return self._metrics_of_rows(record, plans if any(plan is not plans[0] for plan in plans) else plans[:1])
 
-    def _metrics_of_rows(self, record: SignalRecord, plan: Trajectory) -> list[dict[str, float]]:
-        """Metrics of each loop of a record, and of the path of the plan."""
+    def _alike(self, runs: Sequence[Run]) -> bool:
+        """Whether runs have all samples, and the same signals."""
+        return bool(np.count_nonzero(self.timepts >= self.since) > 1) and all(
+            run.plan.naxes == len(self.axes)
+            and run.controls == runs[0].controls
+            and np.array_equal(run.t, self.timepts)
+            for run in runs
+        )
+
+    def _metrics_of_rows(self, record: SignalRecord, plans: Sequence[Trajectory]) -> list[dict[str, float]]:
+        """Metrics of each loop of a record, and of the path of its plan; all have the same if one is given."""
         wanted = wanted_measures(self.measures)
-        values = signal_metrics(record, plan, self.since, self.band, wanted)
-        of_path = path_metrics(plan, self.waypoints, wanted)
-        return [{key: float(row[i]) for key, row in values.items()} | of_path for i in range(len(record.y))]
+        values = signal_metrics(record, plans, self.since, self.band, wanted)
+        of_path = [path_metrics(plan, self.waypoints, wanted) for plan in plans]
+        each = zip(range(len(record.y)), of_path * (len(record.y) if len(plans) == 1 else 1), strict=True)
+        return [{key: float(row[i]) for key, row in values.items()} | own for i, own in each]
 
     @property
     def has_own_measures(self) -> bool:
@@ -427,7 +444,7 @@ class Experiment(Displayed):
             record = SignalRecord(run.t, y, u, axes, run.controls, unstable, (run.held_parts,))
             # Of all axes, which another plan may name otherwise, or of those that a log holds.
             plan = run.plan if len(axes) in (0, run.plan.naxes) else run.plan.select(axes)
-            found = signal_metrics(record, plan, self.since, self.band, wanted)
+            found = signal_metrics(record, [plan], self.since, self.band, wanted)
             for kind, held, every in (("response", axes, self.axes), ("control", run.controls, controls)):
                 if len(held) < len(every):
                     found = _of_each(found, [name for name, one in wanted.items() if one.of == kind], held)
@@ -445,20 +462,16 @@ def _of_each(found: Mapping[str, Array], names: Sequence[str], held: Sequence[st
     return {alone.get(key, key): row for key, row in found.items() if key in alone or key not in names}
 
 
-def _each(
-    measured: Callable[[str], tuple[Run, dict[str, float]]], names: Sequence[str]
-) -> tuple[dict[str, tuple[Run, dict[str, float]]], dict[str, str]]:
-    """Results by plan, and reasons of failures; if all fail, the first exception is raised."""
-    results: dict[str, tuple[Run, dict[str, float]]] = {}
+def _each(function: Callable[[str], T], names: Iterable[str]) -> tuple[dict[str, T], dict[str, Exception]]:
+    """Results by plan, and the exceptions of the others."""
+    results: dict[str, T] = {}
     errors: dict[str, Exception] = {}
-    for name in each_plan(names):
+    for name in names:
         try:
-            results[name] = measured(name)
+            results[name] = function(name)
         except Exception as error:  # of the loop with this plan
             errors[name] = error
-    if len(errors) == len(names):
-        raise next(iter(errors.values()))
-    return results, {name: _reason(error) for name, error in errors.items()}
+    return results, errors
 
 
 def _reason(error: Exception) -> str:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Mapping
+from functools import lru_cache, reduce
 
 import control as ct
 import numpy as np
+from numpy.polynomial import Chebyshev
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
-from scipy.optimize import minimize_scalar
 
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.studies.benefit import benefit
@@ -34,9 +34,13 @@ NUMBERED = {
     "trigonometric": {1.0: (26, 4), 5.0: (30, 0), 20.0: (44, 22), 100.0: (-14, 12), 1000.0: (34, 20)},
 }
 """Gains marked in figure 1, with the offsets of their labels [pt]; of two plans only, so that labels do not overlap."""
+DENSE = 30.0
+"""Gain above which those around the jumps are dense enough for curves."""
+BAND = 0.02
+"""Half width of the settling band, relative to the move."""
 SWEPT = ("settling_time", "overshoot_error", "control_peak", "control_effort")
 FED = "trigonometric, feedforward"
-STEP_LIMIT = (-np.log(0.02) / 0.5, 100.0)
+STEP_LIMIT = (-np.log(BAND) / 0.5, 100.0)
 """Limit of settling time [s] and overshoot [%] of the step response for infinite gain."""
 
 
@@ -57,8 +61,10 @@ def linear_study(progress: bool = True, count: int = 121, finest: float = 1e-3) 
     progress : bool, optional
         Show a bar on stderr.
     count : int, optional
-        Gains before refinement: as many evenly spaced in their square root, the
-        frequency of the loop, and half as many in their logarithm.
+        Gains from whose loops jumps of settling times are predicted: as many evenly
+        spaced in their square root, the frequency of the loop, and half as many in
+        their logarithm. Of the latter, those below 30 are swept, with gains around the
+        jumps.
     finest : float, optional
         Relative spacing of gains to which jumps of a settling time are located.
 
@@ -137,30 +143,60 @@ def _loop(gain: float) -> ct.StateSpace:
     return integrator_lag_loop(gain, outputs=("y", "u"))
 
 
+@lru_cache(maxsize=1)
+def _matrices() -> tuple[tuple[Array, Array], ...]:
+    """A, B, C and D of the loop: each for gain 0, and its derivative; they are affine functions of the gain."""
+    zero, one = ([np.asarray(getattr(_loop(gain), name)) for name in "ABCD"] for gain in (0.0, 1.0))
+    return tuple((m, n - m) for m, n in zip(zero, one, strict=True))
+
+
+def _swept_loop(gain: float) -> ct.StateSpace:
+    """The same loop in one block, which is built faster than three."""
+    a, b, c, d = (zero + gain * slope for zero, slope in _matrices())
+    return ct.StateSpace(a, b, c, d, inputs="r", outputs=["y", "u"], name="loop")
+
+
 def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
     """Sweep over the gain, refined between gains where a settling time jumps, or changes steeply.
 
-    Jumps after the move are known before the sweep; it finds the others.
+    Most jumps are known before the sweep; it finds the others.
     """
-    built = lru_cache(maxsize=None)(_loop)
-
-    def swept(gains: Array) -> Sweep:
-        found = sweep(built, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", measures=SWEPT)
-        if found.interrupted:  # an incomplete sweep is not a result
-            raise KeyboardInterrupt
-        return found
-
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
-    gains = np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 2)), list(NUMBERED["step"]))
-    found = swept(np.union1d(gains, _around_jumps(gains, [built(gain) for gain in gains.tolist()], finest)))
+    base = np.union1d(np.geomspace(*GAINS, count // 2), list(NUMBERED["step"]))
+    own = np.union1d(base[base < DENSE], [*NUMBERED["step"], GAINS[1]])
+    gains = np.union1d(own, _around_jumps(np.union1d(even, base), finest))
+    every = _strides(gains)
+    plans = linear_plans()
+    groups = [(gains[every == k], k) for k in np.unique(every).tolist()]
+    found = reduce(Sweep.merged, (_swept(some, plans, SWEPT, k, progress) for some, k in groups))
     while True:
         settling = [rows["settling_time"] for rows in found.metrics.values()]
         jump, steep = (np.any([settling_jumps(found.values, r, s) for r in settling], axis=0) for s in (3.0, 1.5))
         widest = np.select([jump, steep], [finest, max(finest, 0.02)], np.inf)
-        parts = np.minimum(_parts(found.values, widest), 8)
+        parts = np.minimum(_parts(found.values, widest), 16)
         if parts.max() == 1:
             return found
-        found = found.merged(swept(np.setdiff1d(_divided(found.values, parts), found.values)))
+        gains = np.setdiff1d(_divided(found.values, parts), found.values)
+        found = found.merged(_swept(gains, plans, SWEPT, int(_strides(gains).min()), progress))
+
+
+def _swept(gains: Array, plans: dict[str, Trajectory], measures: tuple[str, ...], every: int, progress: bool) -> Sweep:
+    """Metrics at gains, from every so many of the sample times."""
+    times = TIMEPTS[::every]
+    found = sweep(_swept_loop, gains, plans, times, progress=progress, parameter="gain", measures=measures)
+    if found.interrupted:  # an incomplete sweep is not a result
+        raise KeyboardInterrupt
+    return found
+
+
+def _strides(gains: Array) -> NDArray[np.intp]:
+    """Intervals between samples of the sweep, in those of `TIMEPTS`: 1, 2 or 4.
+
+    The loop oscillates with the square root of the gain: a gain of a fourth has as many
+    samples in a period at half of the times. Metrics are then as accurate as at the
+    highest gain, to a few 1e-6 of their value.
+    """
+    return 2 ** np.clip(np.floor(0.5 * np.log2(GAINS[1] / gains)), 0.0, 2.0).astype(np.intp)
 
 
 def _parts(gains: Array, widest: ArrayLike) -> NDArray[np.intp]:
@@ -175,50 +211,82 @@ def _divided(gains: Array, parts: NDArray[np.intp]) -> Array:
     return np.append(gains[left] * (gains[left + 1] / gains[left]) ** part, gains[-1])
 
 
-def _around_jumps(gains: Array, loops: Sequence[ct.StateSpace], finest: float) -> Array:
-    """Gains on both sides of the jumps of settling times after the move, on a subdivision of given gains and loops.
+def _around_jumps(gains: Array, finest: float) -> Array:
+    """Gains on both sides of the jumps of settling times, on a subdivision of gains.
 
-    They enclose a jump to `finest`. One more gain is up to 24 times as far on the side
-    where the extremum is outside of the band: there the curve begins like a square root.
+    The jumps are predicted from the loops of these gains, and enclosed to `finest`. One
+    more gain is up to 24 times as far on the side where the extremum is outside of the
+    band: there the curve begins like a square root.
     """
     parts = _parts(gains, finest)
     fine, ends = _divided(gains, parts), np.cumsum(parts)
     around = []
     for plan in linear_plans().values():
-        after = CubicSpline(np.sqrt(gains), _after_move(loops, plan))(np.sqrt(fine))  # analytic functions of the gain
-        change = np.diff(np.floor(_last_extremum_outside(*after.T)))
-        jump = np.flatnonzero(np.abs(change) > 0.0)
+        change = _changes(gains, fine, parts, plan)
+        jump = np.flatnonzero(change)
         where = np.searchsorted(ends, jump, side="right")
-        first, last = ends[where] - parts[where], ends[where]
-        far = np.clip(np.where(change[jump] > 0.0, jump + 24, jump - 23), first, last)
+        far = np.clip(np.where(change[jump] > 0.0, jump + 24, jump - 23), ends[where] - parts[where], ends[where])
         around += [fine[jump], fine[jump + 1], fine[far]]
     return np.concatenate(around)
 
 
-def _after_move(loops: Sequence[ct.StateSpace], plan: Trajectory) -> Array:
-    """Error and its derivative at the end of the move; sum and product of the poles, shape (nloops, 4)."""
-    a, b, c = (np.array([getattr(loop, name) for loop in loops]) for name in "ABC")
-    rest = np.linalg.solve(a, -b)[..., 0]
-    times = np.linspace(WAYPOINTS[0].time, WAYPOINTS[-1].time, 65)
-    states = exact_states(a, b, plan.segment_jet_at, list(plan.breakpoints), times, 0.0 * rest)
-    error = (states[..., -1] - rest)[..., None]
-    rows = [c[:, :1] @ error, c[:, :1] @ a @ error]
-    return np.column_stack([row.ravel() for row in rows] + [np.trace(a, axis1=1, axis2=2), np.linalg.det(a)])
+def _changes(gains: Array, fine: Array, parts: NDArray[np.intp], plan: Trajectory) -> Array:
+    """Changes of the last extremum outside of the settling band between neighbours of `fine`; 0 where it is the same.
+
+    By interpolation from the loops of `gains`, whose intervals are divided into `parts`.
+    """
+    errors, free = _errors(gains, plan)
+    frequency = np.sqrt(gains), np.sqrt(fine)  # errors are analytic functions of it
+    extremum, ended = _last_extremum_outside(*CubicSpline(frequency[0], free)(frequency[1]).T)
+    after = np.nan_to_num(np.diff(np.floor(extremum)))
+    # During the move: by the last sample outside, between gains where it changes by more than it does with an extremum.
+    changed = np.repeat(settling_jumps(gains, _last_outside(errors), 1.5), parts)
+    some = np.flatnonzero(ended & (np.append(changed, False) | np.append(False, changed)))
+    last = np.full(fine.size, np.nan)
+    last[some] = _last_outside(CubicSpline(frequency[0], errors)(frequency[1][some]))
+    during = np.diff(last)
+    return np.where(ended[1:] & ended[:-1], np.where(np.abs(during) > 1.0, during, 0.0), after)
 
 
-def _last_extremum_outside(error: Array, slope: Array, total: Array, product: Array) -> Array:
+def _errors(gains: Array, plan: Trajectory) -> tuple[Array, Array]:
+    """Difference from the final value during the move, and the free motion after it.
+
+    Returns
+    -------
+    ndarray, shape (ngains, 257)
+        Difference of the output from its final value at even times of the move.
+    ndarray, shape (ngains, 4)
+        This at the end of the move, and its derivative; sum and product of the poles.
+    """
+    a, b, c, _ = (zero + gains[:, None, None] * slope for zero, slope in _matrices())
+    read = np.concatenate([c[:, :1], c[:, :1] @ a], axis=1)
+    times = np.linspace(WAYPOINTS[0].time, WAYPOINTS[-1].time, 257)
+    rest = np.asarray(np.linalg.solve(a, -b), dtype=float)
+    states = exact_states(a, b, plan.segment_jet_at, list(plan.breakpoints), times, 0.0 * rest[..., 0], read)
+    errors = states - read @ rest
+    return errors[:, 0], np.column_stack([errors[..., -1], np.trace(a, axis1=1, axis2=2), np.linalg.det(a)])
+
+
+def _last_outside(errors: Array) -> Array:
+    """Number of samples up to the last one outside of the settling band, for each row."""
+    return errors.shape[1] - np.argmax(np.abs(errors[:, ::-1]) > BAND, axis=1).astype(float)
+
+
+def _last_extremum_outside(error: Array, slope: Array, total: Array, product: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Number of the last extremum outside of the settling band after the move, for increasing gains.
 
     Continued to real numbers: the settling time jumps where it passes an integer.
-    nan if all extrema are inside. Arguments as by `_after_move`.
+    nan if all extrema are inside. Second, whether there is no extremum outside after
+    the end of the move. Arguments as by `_errors`.
     """
     # The error is Re(size exp(pole t)), with extrema where Re(pole size exp(pole t)) = 0.
     pole = 0.5 * total + 1j * np.sqrt(np.maximum(product - 0.25 * total**2, 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):  # at the double pole
         size = error - 1j * (slope - pole.real * error) / pole.imag
-        time = np.log(0.02 * np.abs(pole) / (np.abs(size) * pole.imag)) / pole.real
-        number = (np.unwrap(np.nan_to_num(np.angle(pole * size))) + pole.imag * time) / np.pi - 0.5
-    return np.where(time > 0.0, number, np.nan)
+        time = np.log(BAND * np.abs(pole) / (np.abs(size) * pole.imag)) / pole.real
+        angle = np.unwrap(np.nan_to_num(np.angle(pole * size)))
+        number = np.where(time > 0.0, (angle + pole.imag * time) / np.pi - 0.5, np.nan)
+        return number, ~((np.floor(number) + 0.5) * np.pi >= angle)
 
 
 def _notes(comparison: Comparison, swept: Sweep) -> list[str]:
@@ -268,14 +336,23 @@ def overshoot_peak(gains: Array, overshoot: Array) -> tuple[float, float]:
     """Gain at which the overshoot of the trigonometric plan peaks, and the peak [%], between the gains swept."""
     plan = linear_plans()["trigonometric"]
 
-    def overshoot_at(log_gain: float) -> float:
-        found = compare(_loop(float(np.exp(log_gain))), {"it": plan}, TIMEPTS, measures=("overshoot_error",))
-        return -found.metrics["it"]["overshoot_error"]
+    def overshoot_at(frequency: Array) -> Array:
+        found = _swept(frequency**2, {"it": plan}, ("overshoot_error",), int(_strides(frequency**2).min()), False)
+        return found.metrics["it"]["overshoot_error"]
 
-    top = int(np.argmax(overshoot))
-    around = np.log(gains[[max(top - 1, 0), min(top + 1, gains.size - 1)]])
-    best = minimize_scalar(overshoot_at, bounds=tuple(around.tolist()), method="bounded", options={"xatol": 1e-5})
-    return float(np.exp(best.x)), -float(best.fun)
+    frequency, values = np.sqrt(gains), overshoot
+    while True:
+        top = int(np.argmax(values))
+        low, high = frequency[[max(top - 1, 0), min(top + 1, frequency.size - 1)]].tolist()
+        if high - low < 0.25:  # a smooth function there
+            break
+        frequency = np.linspace(low, high, 9)
+        values = overshoot_at(frequency)
+    curve = Chebyshev.interpolate(overshoot_at, 8, domain=[low, high])
+    level = curve.deriv().roots()
+    found = [low, high, *level.real[(level.imag == 0.0) & (level.real > low) & (level.real < high)].tolist()]
+    best = max(found, key=curve)
+    return float(best**2), float(curve(best))
 
 
 def _shares(gains: Array, where: NDArray[np.bool_]) -> str:

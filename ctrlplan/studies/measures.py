@@ -550,7 +550,7 @@ class SignalRecord:
 
 
 def signal_metrics(
-    record: SignalRecord, plan: Trajectory, start: float, band: float, measures: Mapping[str, Measure]
+    record: SignalRecord, plans: Sequence[Trajectory], start: float, band: float, measures: Mapping[str, Measure]
 ) -> dict[str, Array]:
     """Metrics of responses and controls.
 
@@ -561,8 +561,8 @@ def signal_metrics(
     ----------
     record : SignalRecord
         The signals.
-    plan : Trajectory
-        Reference of the outputs.
+    plans : sequence of Trajectory
+        Reference of the outputs: one for all loops, or one for each.
     start, band : float
         Start of the interval of the metrics [s], and the settling band.
     measures : mapping of str to Measure
@@ -573,7 +573,7 @@ def signal_metrics(
     dict of str to ndarray, shape (nloops,)
     """
     known = slice(int(np.searchsorted(record.t, start)), None)  # no copy of the rows
-    t, course = record.t[known], _Course.of(plan, record.t[known])
+    t, course = record.t[known], _Course.of(plans, record.t[known])
     parts, count = [], rows_together(record.t.size)
     for first in range(0, len(record.y), count):
         some = slice(first, first + count)
@@ -581,7 +581,7 @@ def signal_metrics(
         of_y, of_u = (record.held_parts(some, of) for of in (slice(y.shape[1]), slice(y.shape[1], None)))
         acting = [Acting(t, rows, start, held) for rows, held in _with_held(_rows(u), of_u)]
         kinds: list[_Seen] = [
-            ("response", _tracked(t, y, course, band, start, of_y), record.axes),
+            ("response", _tracked(t, y, course.some(some), band, start, of_y), record.axes),
             ("control", acting, record.controls),
         ]
         parts.append(_values(kinds, measures, record.unstable[some], Evaluation(t)))
@@ -638,7 +638,7 @@ def _with_held(
 
 @dataclass(frozen=True)
 class _Course:
-    """Positions of a plan at sample times, and its ends and range, (naxes, ...)."""
+    """Positions of plans at sample times, and their ends and ranges, (nplans, naxes, ...)."""
 
     reference: Array
     initial: Array
@@ -646,10 +646,17 @@ class _Course:
     span: Array
 
     @classmethod
-    def of(cls, plan: Trajectory, t: Array) -> _Course:
-        extrema = plan.extrema()
-        span = np.maximum(extrema.maximum - extrema.minimum, np.abs(plan.final - plan.initial))
-        return cls(plan.jet(t, 0)[0], plan.initial, plan.final, span)
+    def of(cls, plans: Sequence[Trajectory], t: Array) -> _Course:
+        extrema = [plan.extrema() for plan in plans]
+        initial, final = (np.array([getattr(plan, name) for plan in plans]) for name in ("initial", "final"))
+        span = np.maximum([one.maximum - one.minimum for one in extrema], np.abs(final - initial))
+        return cls(np.stack([plan.jet(t, 0)[0] for plan in plans]), initial, final, span)
+
+    def some(self, loops: slice) -> _Course:
+        """The same for some of the loops."""
+        if len(self.span) == 1:
+            return self
+        return _Course(self.reference[loops], self.initial[loops], self.final[loops], self.span[loops])
 
 
 def _tracked(
@@ -658,7 +665,7 @@ def _tracked(
     """Arguments of measures of responses, for each of `_rows`."""
     found = []
     for k, (rows, parts) in enumerate(_with_held(_rows(y), held)):
-        own = slice(None) if len(y) == 1 else slice(k, k + 1)
+        own = (0,) if len(y) == 1 else (slice(None), k)
         of_plan = (course.reference[own], course.initial[own], course.final[own], course.span[own])
         found.append(Tracked(t, rows, *of_plan, band, start, parts))
     return found
@@ -709,12 +716,12 @@ def path_metrics(
 ) -> dict[str, float]:
     """Metrics of the path of a reference between its waypoints."""
     points = np.array([w.position for w in waypoints]).T
-    if len(waypoints) < 2 or np.isnan(points).any():
+    functions = _functions("path", MEASURES if measures is None else measures)
+    if len(waypoints) < 2 or not functions or np.isnan(points).any():
         return {}
     t = np.linspace(waypoints[0].time, move_end(plan, waypoints), 2001)
     seen = Path(plan, t, plan.jet(t, 0)[0], points)
-    wanted = MEASURES if measures is None else measures
-    return {name: float(function(seen)) for name, function in _functions("path", wanted)}
+    return {name: float(function(seen)) for name, function in functions}
 
 
 def move_end(plan: Trajectory, waypoints: Sequence[Waypoint]) -> float:

@@ -75,6 +75,16 @@ def test_loops_of_every_gain_at_even_times(alpha, count):
     check([lag_loop(gain) for gain in GAINS], plan, signals, t, some=np.arange(0, count, count // 20))
 
 
+@pytest.mark.parametrize("systems", [GAINS[1:6], [5.0]])
+@pytest.mark.parametrize("count", [451, 1801])
+def test_breakpoints_that_are_sample_times(systems, count):
+    """0.4 and 1.7 s, with few samples and with many in the cells of the move."""
+    plan, signals = both(*REST, 4.0)
+    t = np.linspace(0.0, 9.0, count)
+    assert np.abs(t[:, None] - REST[0]).min(axis=0).max() < 1e-14
+    check([lag_loop(gain) for gain in systems], plan, signals, t, some=np.arange(0, count, count // 15))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("even", [True, False])

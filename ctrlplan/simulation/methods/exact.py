@@ -10,8 +10,9 @@ import numpy as np
 
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array
+from ctrlplan.simulation.analytic_segments import Jet
 from ctrlplan.simulation.events import Snapshot
-from ctrlplan.simulation.exact import Jet, exact_states, sampled_states
+from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.held_outputs import of_delayed, of_sampled
 from ctrlplan.simulation.job import Job, Record, with_event_times
 from ctrlplan.simulation.linear import LinearForm
