@@ -1290,7 +1290,7 @@ class Trajectory(Displayed, Fields, ABC):
 
     @property
     def polynomial_degree(self) -> int | None:
-        """Maximum degree of the segments, if all are polynomials; None otherwise."""
+        """Maximum degree of the segments; None if not polynomials."""
         return None
 
     def segment_jet_at(self, moment: float, origin: float, s: Array, order: int) -> Array:
