@@ -18,6 +18,7 @@ from ctrlplan.planning.bounds import limit_words
 from ctrlplan.planning.limits import Limited
 from ctrlplan.planning.quantities import System as Quantified
 from ctrlplan.simulation import state_space
+from ctrlplan.simulation.analytic_segments import spacing
 from ctrlplan.simulation.built_forms import shared_forms
 from ctrlplan.studies.baselines import are_equal, baseline_plans, derivative_limits, peak_limits, profiles
 from ctrlplan.studies.comparison import Comparison, comparison_of, finite_or_none
@@ -297,7 +298,9 @@ class _Setting:
     ) -> tuple[Experiment, Measured]:
         """Run plans through waypoints; the simulated time is extended for longer plans."""
         times, late = self.experiment.timepts, points[-1].time - self.reference.end
-        more = np.arange(times[-1], times[-1] + max(late, 0.0), np.median(np.diff(times)))[1:]
+        # Evenly spaced times remain so, up to rounding.
+        step = spacing(times, float(np.ptp(times))) or float(np.median(np.diff(times)))
+        more = times[-1] + step * np.arange(1, math.ceil(late / step - 1e-6) + 1)
         loop, followed = _followable(self.loop, plans)
         experiment = replace(
             self.experiment,

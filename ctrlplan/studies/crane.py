@@ -455,9 +455,8 @@ def _speed_curves(points: tuple[Waypoint, Waypoint]) -> Curves:
             if abs(np.cos(0.5 * alpha - np.pi / 2)) > 1e-3
             else None
         )
-        ends = np.full(2, np.nan) if fixed is None else np.hypot(*fixed.jet([0.0, 30.0], 1)[1])
-        rows["start, gamma pi/2"].append(float(ends[0]))
-        rows["end, gamma pi/2"].append(float(ends[1]))
+        for name, end in (("start, gamma pi/2", 0.0), ("end, gamma pi/2", 30.0)):
+            rows[name].append(np.nan if fixed is None else float(np.hypot(*fixed.jet(end, 1)[1])))
         mean = TrigSpline(points, alpha=alpha, warn=False)
         rows["both ends, gamma mean"].append(float(np.hypot(*mean.jet(30.0, 1)[1])))
     return Curves(

@@ -48,6 +48,13 @@ class _OfParts(Trajectory):
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
         """Set the fields."""
 
+    @property
+    def polynomial_degree(self) -> int | None:
+        """Maximum degree of the parts; as `Trajectory.polynomial_degree`."""
+        degrees = [part.polynomial_degree for part in self.parts]
+        known = [degree for degree in degrees if degree is not None]
+        return max(known) if len(known) == len(degrees) else None
+
     def map_time(self, origin: float, target: float, rate: float) -> Self:
         """Same path at other times; as `Trajectory.map_time`."""
         return self._of(tuple(part.map_time(origin, target, rate) for part in self.parts), self.labels)

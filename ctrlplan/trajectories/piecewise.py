@@ -630,6 +630,13 @@ class PiecewiseSpline(WaypointSpline):
         times = self.breakpoints
         return readonly(times[1:] - times[:-1])
 
+    @property
+    def polynomial_degree(self) -> int | None:
+        """Maximum degree of the segments, if alpha is 0; as `Trajectory.polynomial_degree`."""
+        if self.alpha:
+            return None
+        return max(run.system.size for pieces in self._pieces for run in pieces.runs) - 1
+
     def stationary_places(self, nu: int) -> tuple[NDArray[np.intp], Array] | None:
         """Places of the stationary points of polynomials; as `Trajectory.stationary_places`."""
         if self.alpha:

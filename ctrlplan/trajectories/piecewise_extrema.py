@@ -8,7 +8,7 @@ an extremum inside; the stationary points of those are computed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 
 from ctrlplan.trajectories.chebyshev import roots_of_rows
 from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers, readonly
+
+_LOW = 7
+"""Maximum degree of polynomials about their start that are as accurate on the whole segment."""
 
 _PARTS = 4
 """Number of parts of a segment with their own bounds."""
@@ -123,6 +126,20 @@ def stationary_places(groups: Iterable[Sequence[Polynomials]], durations: Array,
                 times.append(0.5 + 0.5 * roots)
     chosen = np.concatenate(segments)
     return chosen, np.concatenate(times) * durations[chosen]
+
+
+def places_of_low_degree(
+    segments_jet: Callable[[NDArray[np.intp], Array, int], Array], durations: Array, degree: int, nu: int
+) -> Places | None:
+    """The same of polynomials that are known by their jets, as `Trajectory.segments_jet`; None at high degrees."""
+    if degree > _LOW or not durations.size:
+        return None
+    count, orders = durations.size, np.arange(degree + 1)
+    with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+        jets = segments_jet(np.arange(count), np.zeros(count), degree)
+        powers = durations ** orders[:, None] / FACTORIALS[orders, None]
+        own = Polynomials(Powers(degree + 1), 0, jets * powers[:, None])
+    return stationary_places([[own]], durations, nu)
 
 
 def _beyond_ends(runs: Sequence[Polynomials], durations: Array, nu: int) -> NDArray[np.bool_] | None:

@@ -148,6 +148,11 @@ class PiecewisePolynomial(Trajectory):
                     out[0][:, outside] = held[:, None]
         return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
+    @property
+    def polynomial_degree(self) -> int:
+        """Maximum degree of the segments; as `Trajectory.polynomial_degree`."""
+        return len(self._jets) - 1
+
     def stationary_places(self, nu: int) -> tuple[NDArray[np.intp], Array] | None:
         """Places of the stationary points; as `Trajectory.stationary_places`."""
         durations, size = np.diff(self.breakpoints), len(self._jets)

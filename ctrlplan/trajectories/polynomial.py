@@ -77,6 +77,11 @@ class PolySpline(NewtonSpline):
         if not self._fit(checked_waypoints(waypoints), 0.0, chosen):
             self._check_swing()
 
+    @property
+    def polynomial_degree(self) -> int:
+        """Maximum degree of the axes; as `Trajectory.polynomial_degree`."""
+        return max(self.degree)
+
     def stationary_places(self, nu: int) -> Places | None:
         """Places of the stationary points at moderate degrees; as `Trajectory.stationary_places`."""
         if any(system.size > _MODERATE for _, system, _ in self._parts):

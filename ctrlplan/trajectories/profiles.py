@@ -201,6 +201,11 @@ class _Profile(Trajectory, FromWaypoints):
             _nfall=len(ramp),
         )
 
+    @property
+    def polynomial_degree(self) -> int:
+        """Order of the highest limited derivative; as `Trajectory.polynomial_degree`."""
+        return len(self._names)
+
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         if self._motion is not None:

@@ -66,6 +66,11 @@ class Step(Trajectory):
             breakpoints=readonly(np.array([checked_finite(time, "time")])),
         )
 
+    @property
+    def polynomial_degree(self) -> int:
+        """Degree of a constant; as `Trajectory.polynomial_degree`."""
+        return 0
+
     def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return {

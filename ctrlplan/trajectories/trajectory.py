@@ -27,6 +27,7 @@ from ctrlplan.trajectories.chebyshev import chebyshev_proxy
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.continuity import Jump, find_jumps
 from ctrlplan.trajectories.fields import Fields
+from ctrlplan.trajectories.piecewise_extrema import places_of_low_degree
 from ctrlplan.trajectories.waypoint import ENTRIES, waypoint_table
 
 if TYPE_CHECKING:
@@ -1282,6 +1283,14 @@ class Trajectory(Displayed, Fields, ABC):
         s : ndarray, shape (npoints,)
             Time [s] since its start.
         """
+        degree = self.polynomial_degree
+        if degree is None:
+            return None
+        return places_of_low_degree(self.segments_jet, np.diff(self.breakpoints), degree, nu)
+
+    @property
+    def polynomial_degree(self) -> int | None:
+        """Maximum degree of the segments; None if not polynomials."""
         return None
 
     def segment_jet_at(self, moment: float, origin: float, s: Array, order: int) -> Array:

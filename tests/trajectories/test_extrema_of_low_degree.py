@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
-from ctrlplan import PiecewiseSpline, PolySpline, Waypoint, fastest, fit, margins, stack
+from ctrlplan import PiecewiseSpline, PolySpline, SCurve, Shaper, Trapezoid, Waypoint, fastest, fit, margins, stack
 from ctrlplan.trajectories.chebyshev import roots_of_rows
 
 MOVE = PolySpline([Waypoint(0.0, 0.0, 0.0), Waypoint(4.0, 1.0, 0.0)])  # 3 u^2 - 2 u^3
@@ -114,3 +114,30 @@ def value_at(series, x):
     for c in series[:0:-1]:
         first, second = 2 * x * first - second + mp.mpf(float(c)), first
     return x * first - second + mp.mpf(float(series[0]))
+
+
+SHAPED = Shaper.zvd(2.1)(SCurve([3.0, -1.0], velocity=1.1, acceleration=0.7, jerk=0.9, labels=["x", "z"]))
+
+
+@pytest.mark.parametrize("nu", range(5))
+@pytest.mark.parametrize(
+    "plan",
+    [SHAPED, -0.3 * SHAPED.shift(2.0), SHAPED.then(Trapezoid([5.0, 1.0], [3.0, -1.0], velocity=1.0, acceleration=2.0))],
+    ids=["sum", "scaled", "joined"],
+)
+def test_combinations_of_polynomials_by_the_roots_of_their_slopes(plan, nu):
+    """Each segment as the polynomial through its derivatives in the middle, by numpy."""
+    assert plan.polynomial_degree == 3
+    values = [[], []]
+    for start, end in zip(plan.breakpoints[:-1].tolist(), plan.breakpoints[1:].tolist(), strict=True):
+        middle = 0.5 * (start + end)
+        for axis, jet in enumerate(plan.jet(middle, 3).T):
+            function = Polynomial(jet / [1.0, 1.0, 2.0, 6.0])
+            function = function.deriv(nu) if nu else function
+            roots = [r.real for r in function.deriv().roots() if abs(r.imag) < 1e-12]
+            inside = [r for r in roots if abs(r) < 0.5 * (end - start)]
+            values[axis] += function(np.array([start - middle, end - middle, *inside])).tolist()
+    found = plan.extrema(nu)
+    size = np.abs(values).max() + (not np.abs(values).max())
+    np.testing.assert_allclose(found.maximum, [max(row) for row in values], rtol=0.0, atol=1e-12 * size)
+    np.testing.assert_allclose(found.minimum, [min(row) for row in values], rtol=0.0, atol=1e-12 * size)

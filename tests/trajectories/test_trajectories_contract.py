@@ -146,6 +146,16 @@ def test_shapes(plan):
     np.testing.assert_array_equal(plan([0, 1, 2]), plan(np.array([0.0, 1.0, 2.0])))
 
 
+@every
+def test_polynomial_degree_is_that_of_the_segments(plan):
+    degree = plan.polynomial_degree
+    if degree is not None and plan.duration:
+        jets = plan.jet(plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * [0.2, 0.8], degree + 1)
+        # Relative to the lower derivatives over the shortest segment: the rounding of differences.
+        scale = np.abs(jets[:-1]).max() * np.diff(plan.breakpoints).min() ** -(degree + 1.0)
+        assert np.abs(jets[degree + 1]).max() <= 1e-12 * scale
+
+
 @moving
 def test_jets_of_a_segment_at_many_times_are_those_at_few(plan):
     """Also a little outside of the segment, where its function continues."""

@@ -190,6 +190,8 @@ def jet_of(plans: Sequence[tuple[Trajectory, int]]) -> Jet:
 
     def jet(moment: float, origin: float, s: Array, order: int) -> Array:
         rows = [plan.segment_jet_at(moment, origin, s, order + high) for plan, high in plans]
+        if len(plans) == 1 and not plans[0][1]:
+            return rows[0]
         signals = [_derivatives(row, high, order) for row, (_, high) in zip(rows, plans, strict=True)]
         return np.concatenate(signals, axis=1) if signals else np.zeros((order + 1, 0, s.size))
 
