@@ -5,6 +5,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.metrics._error import squared
 from ctrlplan.metrics._evaluation import Evaluation, Later, evaluated
+from ctrlplan.metrics._extremes import may_reach
+from ctrlplan.metrics._grid import Grid
 from ctrlplan.metrics._pieces import cubics
 from ctrlplan.metrics._records import QUIET, Array, Value, diverged, each, fitted, real, times
 from ctrlplan.metrics._records import signal as checked
@@ -205,6 +207,8 @@ def _saturated(t: Array, u: Array, low: float, high: float) -> float:
 
 def _beyond(t: Array, g: Array, tolerance: float) -> float:
     """Return the time during which g >= 0, where samples within the tolerance are at the limit."""
+    if not may_reach(Grid.of(t), g, -tolerance):
+        return 0.0
     at = g >= -tolerance
     resting = at & (g <= tolerance)
     stays = np.flatnonzero(resting[:-1] & resting[1:])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.metrics._extremes import Sought, bounds, largest, last_beyond, last_entries, search
-from ctrlplan.metrics._grid import Grid
+from ctrlplan.metrics._grid import LONG, Grid
 from ctrlplan.metrics._held import Held, Stepped
 from ctrlplan.metrics._integrals import areas, rough, squares
 from ctrlplan.metrics._pieces import cubics_of_rows
@@ -20,7 +20,8 @@ from ctrlplan.metrics._records import HUGE, QUIET, Array, Value, plain, real
 
 Later = Callable[[], Array]
 
-TOGETHER = 2**17  # samples of a signal over the rows that are evaluated together, for memory
+_SAMPLES = 2**19  # of a signal over the rows that are evaluated together, for memory
+_SAMPLES_OF_SHORT = 2**16  # the same for short records, whose integrals need the cubics of all intervals
 
 
 class _Wanted:
@@ -153,7 +154,7 @@ class Evaluation:
             np.concatenate([np.where(never, np.nan, edges), np.where(np.isfinite(top), top, np.nan)]),
             np.concatenate([first, np.zeros_like(others)]),
         )
-        number, k = search(grid, f, limits, sought)
+        number, k = search(grid, f, limits, sought) if sought.rows.size else (sought.rows, sought.rows)
         places = [(sought.rows[number], k)]
         for (kind, start), part in self._integrals.items():
             row, at = rough(grid, f[part], finite[part], kind is areas)
@@ -173,6 +174,11 @@ class Evaluation:
         return np.where(never, np.inf, entries), maxima, integrals
 
 
+def rows_together(ntime: int) -> int:
+    """Return how many rows of signals with ntime samples are evaluated together."""
+    return max(1, (_SAMPLES if ntime >= LONG else _SAMPLES_OF_SHORT) // ntime)
+
+
 def evaluated(want: Callable[..., Later], timepts: ArrayLike, signals: Array, name: str, *levels: Array) -> Value:
     """Return a metric of signals (..., ntime): `want` is called with an evaluation, rows and levels (...).
 
@@ -180,7 +186,7 @@ def evaluated(want: Callable[..., Later], timepts: ArrayLike, signals: Array, na
     """
     lead = signals.shape[:-1]
     rows, own = signals.reshape(-1, signals.shape[-1]), [np.broadcast_to(level, lead).ravel() for level in levels]
-    count, values = max(1, TOGETHER // signals.shape[-1]), np.empty(len(rows))
+    count, values = rows_together(signals.shape[-1]), np.empty(len(rows))
     for begin in range(0, len(rows), count):
         some, evaluation = slice(begin, begin + count), Evaluation(timepts)
         wanted = want(evaluation, evaluation.add(rows[some], name), *(level[some] for level in own))

@@ -35,8 +35,6 @@ def bounds(grid: Grid, f: Array) -> Array:
 def search(grid: Grid, f: Array, limits: Array, sought: Sought) -> Places:
     """Return the intervals in which cubics may exceed a level, as numbers of `sought` and of intervals, in order.
 
-    The first interval and the last one, with no bound, are included.
-
     Parameters
     ----------
     grid, f : Grid and ndarray, shape (nrows, ntime)
@@ -47,8 +45,10 @@ def search(grid: Grid, f: Array, limits: Array, sought: Sought) -> Places:
         Levels of some of the signals.
     """
     ntime, usable = grid.t.size, ~np.isnan(sought.levels)
-    some = np.flatnonzero(usable) * ntime
-    found = [some + sought.first[usable], some + (ntime - 2)]
+    at_ends = _at_ends(grid, f, sought) if ntime > 3 else np.ones((2, usable.size), dtype=np.bool_)
+    at_ends[0] |= sought.first > 0
+    early, late = (np.flatnonzero(usable & one) for one in at_ends)
+    found = [early * ntime + sought.first[early], late * ntime + (ntime - 2)]
     if ntime > 3:
         # Stretches of smaller samples are far below the level, also between samples; nan cannot be excluded.
         large = ~(_reach(grid, limits)[:, sought.rows] <= sought.levels[:, None])
@@ -60,6 +60,25 @@ def search(grid: Grid, f: Array, limits: Array, sought: Sought) -> Places:
             own = slice(begin, begin + _WINDOWS)
             found.append(_inside(grid, f, sought, 1.0 - 2.0 * below[own], number[own], stretch[own]))
     return np.divmod(np.sort(np.concatenate(found)), ntime)
+
+
+def may_reach(grid: Grid, f: Array, level: float) -> bool:
+    """Return whether the cubics of one signal (ntime,) may reach a level."""
+    row = f[None]
+    below = np.nextafter(level, -np.inf)
+    sought = Sought(np.zeros(1, dtype=np.intp), np.ones(1), np.full(1, below), np.zeros(1, dtype=np.intp))
+    return bool(search(grid, row, bounds(grid, row), sought)[0].size)
+
+
+def _at_ends(grid: Grid, f: Array, sought: Sought) -> NDArray[np.bool_]:
+    """Return in which first and last intervals, (2, n), cubics may exceed a level; at least four samples."""
+    near = grid.ends
+    samples = f[sought.rows, near.samples]
+    d = np.diff(np.diff(samples, axis=0) / near.step, axis=0) / near.width
+    bow = np.abs(d[0]) + near.reach * np.abs((d[1] - d[0]) / near.span)
+    outer = samples[:2]
+    top = np.where(sought.sides == 0.0, np.abs(outer), sought.sides * outer).max(axis=0)
+    return np.asarray(~(top + near.quarter * bow <= sought.levels))
 
 
 def _reach(grid: Grid, limits: Array) -> Array:
@@ -119,6 +138,8 @@ def last_entries(grid: Grid, edges: Array, number: NDArray[np.intp], k: NDArray[
     -inf if always, inf if a signal is outside after the last sample but one.
     """
     found = np.full(edges.size, -np.inf)
+    if not number.size:
+        return found
     cuts, values = p.cuts[:, : k.size], p.values[:, : k.size]
     beyond = np.abs(values) > edges[number]
     leaving = np.flatnonzero(beyond.any(axis=0))

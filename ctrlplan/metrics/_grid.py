@@ -27,6 +27,20 @@ class Windows(NamedTuple):
     share: Array
 
 
+class Ends(NamedTuple):
+    """Four samples from either end inwards, shape (4, 2, 1), and factors of their differences.
+
+    Bounds on the curvature of the cubics there are the second difference and `reach` times the third.
+    """
+
+    samples: NDArray[np.intp]
+    step: Array
+    width: Array
+    span: Array
+    reach: Array
+    quarter: Array
+
+
 class Forms(NamedTuple):
     """Integrals of a signal over inner intervals with smooth curvature, where its cubics are linear in four samples.
 
@@ -47,7 +61,7 @@ class Grid:
     def __init__(self, t: Array) -> None:
         self.t = t
         self.step, self.width, self.span = t[1:] - t[:-1], t[2:] - t[:-2], t[3:] - t[:-3]
-        self.pace, self.narrow = 1.0 / self.step, 1.0 / self.width
+        self.pace, self.narrow, self.spread = 1.0 / self.step, 1.0 / self.width, 1.0 / self.span
         self.quarter = self.step[1:-1] ** 2 / 4  # of the larger curvature: bound on the distance from the chord
         self.starts = np.arange(0, t.size, STRETCH)
         # Of four samples in a range of 1: both curvatures are at most 1 / (product of the adjacent steps).
@@ -67,6 +81,14 @@ class Grid:
         inside = np.clip(self.starts - 3, 0, self.t.size - count)[:, None] + np.arange(count)
         factors = (self.pace, self.narrow, self.quarter)
         return Windows(inside, *(factor[inside[:, :-k]] for k, factor in enumerate(factors, 1)))
+
+    @cached_property
+    def ends(self) -> Ends:
+        """Return the samples at both ends; at least four samples."""
+        samples = np.array([[0, 1, 2, 3], [-1, -2, -3, -4]]).T[:, :, None]
+        t = np.abs(self.t[samples] - self.t[samples[:1]])
+        step = np.diff(t, axis=0)
+        return Ends(samples, step, t[2:] - t[:-2], t[3], t[2] + t[1], step[0] ** 2 / 4)
 
     @cached_property
     def formed(self) -> NDArray[np.bool_]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.metrics._grid import LONG, Grid
-from ctrlplan.metrics._pieces import CURVATURES, Pieces, cubics
+from ctrlplan.metrics._pieces import CURVATURES, Pieces, cubics, limited
 from ctrlplan.metrics._records import Array
 
 Places = tuple[NDArray[np.intp], NDArray[np.intp]]
@@ -34,20 +34,33 @@ def _smooth(grid: Grid, f: Array, signed: bool) -> NDArray[np.bool_]:
     slope *= grid.pace
     d = slope[:, 1:] - slope[:, :-1]
     d *= grid.narrow
-    third = np.subtract(d[:, 1:], d[:, :-1], out=slope[:, :-2])
-    np.abs(third, out=third)
+    change = np.subtract(d[:, 1:], d[:, :-1], out=slope[:, :-2])
     np.abs(d, out=d)
     smaller = np.minimum(d[:, :-1], d[:, 1:])
+    size = np.abs(change, out=d[:, 1:])
+    # Both curvatures are reach * step**2 or less.
+    reach = smaller + size if signed else None
     smaller *= CURVATURES
-    smooth = (third <= smaller) & grid.formed
-    if signed:
+    smooth = (size <= smaller) & grid.formed
+    rest = np.flatnonzero(~smooth & grid.formed)
+    smooth.ravel()[rest] = _uncut(grid, slope, *np.divmod(rest, smooth.shape[1]))
+    if reach is not None:
+        reach *= grid.quarter
         size, negative = np.abs(f), f < 0
-        # Both curvatures are smaller * (1 + 1 / CURVATURES) or less.
-        smaller *= (1 + 1 / CURVATURES) * grid.quarter
-        smooth &= smaller <= np.minimum(size[:, 1:-2], size[:, 2:-1], out=third)
+        smooth &= reach <= np.minimum(size[:, 1:-2], size[:, 2:-1], out=smaller)
         turns = negative[:, 1:] != negative[:, :-1]
         smooth &= ~(turns[:, :-2] | turns[:, 1:-1] | turns[:, 2:])
     return np.asarray(smooth)
+
+
+def _uncut(grid: Grid, change: Array, rows: NDArray[np.intp], i: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return whether the cubics of some inner intervals, as about an inflection point, are those of a smooth curvature.
+
+    Their third differences need no limit. `change` (nrows, m + 2) are the differences of the curvatures, then others.
+    """
+    near = np.arange(-1, 2)[:, None] + i
+    before, third, after = change.take(near + rows * change.shape[1], mode="clip") * grid.spread.take(near, mode="clip")
+    return (limited(third, before, after) == third) & (i > 0) & (i < grid.spread.size - 1)
 
 
 def areas(grid: Grid, f: Array, places: Places, p: Pieces) -> Array:

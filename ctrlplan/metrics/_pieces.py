@@ -191,6 +191,13 @@ class Pieces:
         return float(np.sum(self.step * width * total))
 
 
+def limited(c: Array, before: Array, after: Array) -> Array:
+    """Return third differences limited to a multiple of their neighbours."""
+    low = _NEIGHBOURS * np.minimum(np.maximum(before, after), 0.0)
+    high = _NEIGHBOURS * np.maximum(np.minimum(before, after), 0.0)
+    return np.minimum(np.maximum(c, low), high)
+
+
 def cubics_of_rows(grid: Grid, f: Array, rows: NDArray[np.intp], chosen: NDArray[np.intp]) -> Pieces:
     """Return the cubics of several signals (nrows, ntime), each on one interval of one row."""
     ntime = grid.t.size
@@ -198,12 +205,16 @@ def cubics_of_rows(grid: Grid, f: Array, rows: NDArray[np.intp], chosen: NDArray
         whole, shape = cubics(grid.t, f), (len(f), ntime - 1)
         return Pieces(*(np.broadcast_to(array, shape)[rows, chosen] for array in vars(whole).values()))
     deep = (chosen >= 2) & (chosen <= ntime - 4)
+    if deep.all():
+        return _inner_cubics(grid, f, rows, chosen)
     inside, outside = np.flatnonzero(deep), np.flatnonzero(~deep)
     # A cubic depends on the samples up to four intervals away.
     k, width = chosen[outside], min(ntime, 10)
     first = np.clip(k - 4, 0, ntime - width)
     window = first[:, None] + np.arange(width)
     outer = cubics(grid.t[window], f[rows[outside, None], window])[np.arange(k.size), k - first]
+    if not inside.size:
+        return outer
     inner = _inner_cubics(grid, f, rows[inside], chosen[inside])
     place = np.empty_like(chosen)
     place[inside], place[outside] = np.arange(inside.size), np.arange(inside.size, chosen.size)
@@ -288,7 +299,7 @@ def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_], NDArra
     for end, inner, far in ((0, min(1, count - 1), min(2, count - 1)), (-1, max(count - 2, 0), max(count - 3, 0))):
         c, wide = third[..., end], span[..., end]
         change = np.abs(third[..., inner] - twist[..., inner]) * span[..., inner]
-        cut = _cut(c, third[..., inner], third[..., far])
+        cut = limited(c, third[..., inner], third[..., far])
         slope = np.where(steady[..., end] & (change == 0), c, cut)
         rough = np.abs(c - slope) * wide + change
         outer.append((_shrunk(d[..., end], rough), slope, rough > np.abs(c) * wide / 2))
@@ -311,7 +322,7 @@ def _sided(
 
     The third difference is limited to a multiple of its neighbours, with the curvature of the smoother side.
     """
-    cut = _cut(c, before, after)
+    cut = limited(c, before, after)
     size, far = np.abs(one), np.abs(other)
     nearer = np.where(size <= far, one, other - span * cut)
     across = (np.sign(one) * np.sign(other) <= 0) & (np.minimum(size, far) > _ASIDE * np.maximum(size, far))
@@ -328,13 +339,6 @@ def _neighbours(third: Array, at: tuple[NDArray[np.intp], ...]) -> tuple[Array, 
         first = rows[0] * (last + 1)
         return third.take(first + before), third.take(first + after)
     return third[*rows, before], third[*rows, after]
-
-
-def _cut(c: Array, before: Array, after: Array) -> Array:
-    """Return third differences limited to a multiple of their neighbours."""
-    low = _NEIGHBOURS * np.minimum(np.maximum(before, after), 0.0)
-    high = _NEIGHBOURS * np.maximum(np.minimum(before, after), 0.0)
-    return np.minimum(np.maximum(c, low), high)
 
 
 def _between(first: NDArray[G], inner: NDArray[G], last: NDArray[G]) -> NDArray[G]:

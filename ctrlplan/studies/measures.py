@@ -16,7 +16,7 @@ from ctrlplan._display import MISSING, ROWS, Displayed, Facts, Part, number
 from ctrlplan._types import Array
 from ctrlplan.metrics._control import magnitude, varied
 from ctrlplan.metrics._error import absolute
-from ctrlplan.metrics._evaluation import TOGETHER, Evaluation, Later
+from ctrlplan.metrics._evaluation import Evaluation, Later, rows_together
 from ctrlplan.metrics._held import Held
 from ctrlplan.metrics._response import exceeded, settled
 from ctrlplan.planning import SquaredDerivative
@@ -133,7 +133,7 @@ class Path:
     path: Array
     points: Array
 
-    @property
+    @cached_property
     def steps(self) -> bool:
         """Whether the position is discontinuous, so that there is no path."""
         return bool(self.plan.jumps(0))
@@ -574,7 +574,7 @@ def signal_metrics(
     """
     known = slice(int(np.searchsorted(record.t, start)), None)  # no copy of the rows
     t, course = record.t[known], _Course.of(plans, record.t[known])
-    parts, count = [], max(1, TOGETHER // record.t.size)
+    parts, count = [], rows_together(record.t.size)
     for first in range(0, len(record.y), count):
         some = slice(first, first + count)
         y, u = record.y[some, :, known], record.u[some, :, known]

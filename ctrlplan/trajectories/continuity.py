@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ctrlplan.trajectories.extrema import known_results
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -42,8 +44,16 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     The plan is at rest before its start and after its end: a plan that starts
     at nonzero velocity jumps there. Differences below 1e-9 of a derivative's peak, or of the
     range of the position, are rounding, as are those that the rounding of late times or of lower
-    derivatives (`_by_rounding_of_lower`) explains.
+    derivatives (`_by_rounding_of_lower`) explains. Computed once for a plan.
     """
+    known = known_results(plan).jumps
+    if order not in known:
+        known[order] = _found(plan, order)
+    return known[order]
+
+
+def _found(plan: Trajectory, order: int) -> tuple[Jump, ...]:
+    """The same, computed."""
     before, after = _sides(plan, order)
     size = after - before
     size[:, :, -1] = -before[:, :, -1]

@@ -21,6 +21,7 @@ from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.piecewise_extrema import Places
 
 if TYPE_CHECKING:
+    from ctrlplan.trajectories.continuity import Jump
     from ctrlplan.trajectories.trajectory import Trajectory
 
 TOLERANCE = 1e-9
@@ -82,7 +83,7 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class _Known:
+class Known:
     """Results of searches for a plan, which is immutable.
 
     Attributes
@@ -96,6 +97,8 @@ class _Known:
         Orders and segments whose candidates need no Newton step.
     together : dict
         Segments and candidates in them by order, of all segments, relative as well.
+    jumps : dict
+        Jumps of derivatives by the highest order considered.
     lock : context manager
         Held by the thread that searches extrema of the plan.
     """
@@ -104,19 +107,20 @@ class _Known:
     places: dict[tuple[int, int], Array] = field(default_factory=dict)
     exact: set[tuple[int, int]] = field(default_factory=set)
     together: dict[int, Places] = field(default_factory=dict)
+    jumps: dict[int, tuple[Jump, ...]] = field(default_factory=dict)
     lock: AbstractContextManager[object] = field(default_factory=RLock)
 
 
-_KNOWN: dict[int, _Known] = {}
+_KNOWN: dict[int, Known] = {}
 """Known results by the identity of a plan, as long as it exists."""
 
 
-def _known(plan: Trajectory) -> _Known:
+def known_results(plan: Trajectory) -> Known:
     """Known results of a plan."""
     key = id(plan)
     if key not in _KNOWN:
         finalize(plan, _KNOWN.pop, key, None).atexit = False
-    return _KNOWN.setdefault(key, _Known())
+    return _KNOWN.setdefault(key, Known())
 
 
 def keep_places(plan: Trajectory, moved: Trajectory, times: Array, moved_times: Array) -> None:
@@ -130,7 +134,7 @@ def keep_places(plan: Trajectory, moved: Trajectory, times: Array, moved_times: 
         Times [s] that determine the shape of either: waypoints or breakpoints. With
         equal proportions the places are the same up to rounding.
     """
-    known, own = _known(plan), _known(moved)
+    known, own = known_results(plan), known_results(moved)
     own.places.update(known.places)
     if times.size < 2:
         return
@@ -143,7 +147,7 @@ def keep_places(plan: Trajectory, moved: Trajectory, times: Array, moved_times: 
 
 def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     """Extrema of the nu-th derivative, axis by axis; computed once for a plan, returned as the caller's own."""
-    known = _known(plan)
+    known = known_results(plan)
     if nu not in known.extrema:
         with known.lock:  # places that another thread has just found would be taken for those of a similar plan
             if nu not in known.extrema:
@@ -154,8 +158,8 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
 
 def carry_extrema(plan: Trajectory, moved: Trajectory, rate: float) -> None:
     """Keep the known extrema of a plan for the same plan at other times, whose rate is `rate`."""
-    known = _known(moved).extrema
-    for nu, own in _known(plan).extrema.items():
+    known = known_results(moved).extrema
+    for nu, own in known_results(plan).extrema.items():
         with np.errstate(over="ignore", under="ignore"):
             low, high = own.minimum * rate**nu, own.maximum * rate**nu
         sizes = np.abs(np.concatenate([low, high]))
@@ -174,7 +178,7 @@ def search_extrema(plan: Trajectory, orders: Iterable[int]) -> None:
 
     All of them are evaluated at the stationary points of each.
     """
-    known = _known(plan)
+    known = known_results(plan)
     with known.lock:
         missing = [nu for nu in orders if nu and nu not in known.extrema]
         places = [] if plan.in_batches else [_stationary_places(plan, nu) for nu in missing]
@@ -207,7 +211,7 @@ def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
 
 def _stationary_places(plan: Trajectory, nu: int) -> Places | None:
     """Stationary points of all segments, as `Trajectory.stationary_places`, or kept ones."""
-    known = _known(plan).together
+    known = known_results(plan).together
     if nu in known:
         segments, shares = known[nu]
         return segments, shares * (plan.breakpoints[1:] - plan.breakpoints[:-1])[segments]
@@ -224,7 +228,7 @@ def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> None
         return plan.segment_jet(segment, t, order)
 
     duration = float(plan.breakpoints[segment + 1] - plan.breakpoints[segment])
-    known, key = _known(plan), (nu, segment)
+    known, key = known_results(plan), (nu, segment)
     places = known.places
     if key in known.exact:
         t = places[key] * duration

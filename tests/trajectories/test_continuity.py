@@ -180,3 +180,16 @@ def test_a_step_beyond_the_rounding_of_a_distant_position_is_found():
     assert quintic(0.0, 1.0, (1e6, 0.0, 0.0), (1e6 + 1.0, 0.0, 0.0)).jumps(2) == ()
     found = cp.Step(1e6 + 1e-7, 1e6).jumps(2)
     assert [(j.order, j.time, j.size) for j in found] == [(0, 0.0, pytest.approx(1e-7, rel=1e-2))]
+
+
+def test_jumps_are_computed_once(monkeypatch):
+    line = cp.PolySpline([cp.Waypoint(0.0, 0.0), cp.Waypoint(4.0, 8.0)], labels=["y"])
+    moved = line.retime(2.0)
+    assert [j.size for j in line.jumps(1)] == pytest.approx([2.0, -2.0])
+    evaluated = []
+    segment_jet = cp.PolySpline.segment_jet
+    monkeypatch.setattr(cp.PolySpline, "segment_jet", lambda *given: evaluated.append(given) or segment_jet(*given))
+    assert [j.size for j in line.jumps(1)] == pytest.approx([2.0, -2.0])
+    assert evaluated == []
+    assert [j.size for j in moved.jumps(1)] == pytest.approx([4.0, -4.0])  # of another plan: found again
+    assert evaluated != []
