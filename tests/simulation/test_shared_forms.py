@@ -105,6 +105,20 @@ def test_compare_compiles_a_loop_once(built):
     assert len(built) == 1
 
 
+def test_integrators_of_a_form_share_its_derivatives(monkeypatch):
+    """x' = -x^3 from 1 is 1/sqrt(1 + 2 t); each number of sample times has an integrator of its own."""
+    given, whole = [], compiled.ca.integrator
+    monkeypatch.setattr(compiled.ca, "integrator", lambda *all: given.append({**all[-1]["cache"]}) or whole(*all))
+    decaying = cp.prepare(ct.nlsys(lambda t, x, u, p: -(x**3), None, inputs=0, outputs=["x"], states=1, name="cubic"))
+    for count in (11, 21, 31):
+        times = np.linspace(0.0, 2.0, count)
+        found = cp.simulate(decaying, times, None, 1.0, method="compiled")
+        assert np.abs(found.outputs - 1.0 / np.sqrt(1.0 + 2.0 * times)).max() <= 1e-8
+    assert given[0] == {}
+    assert len(given) > 2
+    assert all(found["jacF"].name() == "jacF" for found in given[1:])
+
+
 def test_a_block_that_cannot_be_compiled_is_tried_in_each_loop(built):
     def branching(t, x, u, params):
         return [math.copysign(1.0, u[0] - x[0])]
