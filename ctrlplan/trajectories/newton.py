@@ -430,14 +430,8 @@ class NewtonSystem(Fields):
         if order > _ELEMENTARY:
             return self.taylor(u, order).transpose(1, 0, 2)
         apart = u - self._nodes[:count, None]
-        between = (np.abs(apart) > _APART).all(axis=0)
-        if not between.all():  # a value does not depend on the other times
-            near = self.taylor(u if not between.any() else u[~between], order).transpose(1, 0, 2)
-            if near.shape[-1] == u.size:
-                return near
-            found = np.empty((order + 1, self.size, u.size))
-            found[..., ~between], found[..., between] = near, self.taylor_between(u[between], order)
-            return found
+        near = (np.abs(apart) <= _APART).any(axis=0).nonzero()[0]
+        apart[:, near] = 0.5
         out = np.zeros((order + 1, count + 1, u.size))
         value, bend = out[0], 0.5 * half * half
         value[0] = 1.0
@@ -462,7 +456,10 @@ class NewtonSystem(Fields):
         derivatives *= value
         if self._fold:
             out[:, self.size - 1] += self._fold * out[:, self.size]
-        return out[:, : self.size]
+        found = out[:, : self.size]
+        if near.size:
+            found[:, :, near] = self.taylor(u[near], order).transpose(1, 0, 2)
+        return found
 
     def jet(self, coefficients: Array, u: Array, order: int) -> Array:
         """Taylor coefficients (order + 1, naxes, ntime) of functions at normalised times.
