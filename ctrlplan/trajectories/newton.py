@@ -430,7 +430,7 @@ class NewtonSystem(Fields):
         if order > _ELEMENTARY:
             return self.taylor(u, order).transpose(1, 0, 2)
         apart = u - self._nodes[:count, None]
-        near = (np.abs(apart) <= _APART).any(axis=0).nonzero()[0]
+        near = np.flatnonzero((np.abs(apart) <= _APART).any(axis=0))
         apart[:, near] = 0.5
         out = np.zeros((order + 1, count + 1, u.size))
         value, bend = out[0], 0.5 * half * half
@@ -456,10 +456,9 @@ class NewtonSystem(Fields):
         derivatives *= value
         if self._fold:
             out[:, self.size - 1] += self._fold * out[:, self.size]
-        found = out[:, : self.size]
         if near.size:
-            found[:, :, near] = self.taylor(u[near], order).transpose(1, 0, 2)
-        return found
+            out[:, : self.size, near] = self.taylor(u[near], order).transpose(1, 0, 2)
+        return out[:, : self.size]
 
     def jet(self, coefficients: Array, u: Array, order: int) -> Array:
         """Taylor coefficients (order + 1, naxes, ntime) of functions at normalised times.
