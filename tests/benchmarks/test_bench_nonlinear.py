@@ -249,7 +249,7 @@ def test_metrics_of_draws(benchmark, capsys, crane):
     def metrics(some):
         unstable = np.zeros(len(y[some]), dtype=bool)
         record = SignalRecord(T, y[some], u[some], *SEEN, unstable)
-        return signal_metrics(record, PLAN, 0.0, 0.02, wanted_measures(EIGHT))
+        return signal_metrics(record, [PLAN], 0.0, 0.02, wanted_measures(EIGHT))
 
     def ours():
         return metrics(slice(None))
