@@ -296,7 +296,21 @@ class _Setting:
     def run(
         self, points: tuple[Waypoint, ...], plans: dict[str, Trajectory], measures: Chosen
     ) -> tuple[Experiment, Measured]:
-        """Run plans through waypoints; the simulated time is extended for longer plans."""
+        """Run plans through waypoints."""
+        experiment, loop = self._experiment(points, plans, measures)
+        return experiment, experiment.run(loop)
+
+    def measured(self, points: tuple[Waypoint, ...], plans: dict[str, Trajectory], measures: Chosen) -> Measured:
+        """Metrics of the same, without runs where a linear loop is solved with all plans."""
+        experiment, loop = self._experiment(points, plans, measures)
+        alike = None if is_builder(loop) else experiment.run_alike([loop])
+        solved = alike[0] if alike else None
+        return experiment.run(loop) if solved is None else solved
+
+    def _experiment(
+        self, points: tuple[Waypoint, ...], plans: dict[str, Trajectory], measures: Chosen
+    ) -> tuple[Experiment, System | Builder]:
+        """Experiment and loop for plans through waypoints; the simulated time is extended for longer plans."""
         times, late = self.experiment.timepts, points[-1].time - self.reference.end
         # Evenly spaced times remain so, up to rounding.
         step = spacing(times, float(np.ptp(times))) or float(np.median(np.diff(times)))
@@ -309,7 +323,7 @@ class _Setting:
             waypoints=points,
             measures=measures,
         )
-        return experiment, experiment.run(loop)
+        return experiment, loop
 
     def rows(
         self, factor: float, decisive: Sequence[str], own: Measured
@@ -347,11 +361,11 @@ class _Setting:
         for name in known:
             del others[name]
         try:
-            ran = self.run(points, others, measures)[1] if others else Measured({})
+            ran = self.measured(points, others, measures) if others else Measured({})
         except Exception:  # each of these plans fails: they are run with those that do not
             if not known:
                 raise
-            return self.run(points, plans, measures)[1]
+            return self.measured(points, plans, measures)
         return Measured(
             {name: own.metrics[run] for name, run in known.items()} | ran.metrics,
             {name: own.runs[run] for name, run in known.items()} | ran.runs,
