@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from functools import lru_cache
-from typing import Literal, TypeVar, get_args
+from typing import Literal, get_args
 
 import control as ct
 import numpy as np
@@ -16,8 +15,6 @@ from ctrlplan._types import Array
 
 Output = Literal["y", "u", "e"]
 """Output of a loop: the plant's, the control signal, the error."""
-
-S = TypeVar("S", bound=ct.InputOutputSystem)
 
 
 def integrator_lag_loop(gain: float, outputs: Sequence[Output] = ("y",)) -> ct.InterconnectedSystem:
@@ -106,19 +103,14 @@ def _interconnected(
 ) -> ct.InterconnectedSystem:
     """Loop of three blocks, interconnected once for all gains: python-control requires a millisecond for that."""
     wired = _wired(num, den, outputs)
-    loop, (error, controller, plant) = _copied(wired), (_copied(block) for block in wired.syslist)
+    error, controller, plant = (ct.StateSpace(block, name=block.name) for block in wired.syslist)
     controller.D[0, 0] = gain
+    loop = ct.LinearICSystem(wired, wired, wired.connection_type)
     loop.A, loop.B, loop.C, loop.D = _closed(plant, gain, outputs)
     loop.syslist = [error, controller, plant]
+    for name in ("connect_map", "input_map", "output_map"):
+        setattr(loop, name, getattr(wired, name).copy())
     return loop
-
-
-def _copied(system: S) -> S:
-    """Copy of a system that shares no array and no container with it."""
-    found = copy(system)
-    own = {name: value.copy() for name, value in vars(system).items() if isinstance(value, np.ndarray | dict | list)}
-    vars(found).update(own)
-    return found
 
 
 @lru_cache(maxsize=16)
