@@ -150,6 +150,12 @@ def _matrices() -> tuple[tuple[Array, Array], ...]:
     return tuple((m, n - m) for m, n in zip(zero, one, strict=True))
 
 
+def _swept_loop(gain: float) -> ct.StateSpace:
+    """The same loop in one block, which is built faster than three."""
+    a, b, c, d = (zero + gain * slope for zero, slope in _matrices())
+    return ct.StateSpace(a, b, c, d, inputs="r", outputs=["y", "u"], name="loop")
+
+
 def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
     """Sweep over the gain, refined between gains where a settling time jumps, or changes steeply.
 
@@ -177,7 +183,7 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
 def _swept(gains: Array, plans: dict[str, Trajectory], measures: tuple[str, ...], every: int, progress: bool) -> Sweep:
     """Metrics at gains, from every so many of the sample times."""
     times = TIMEPTS[::every]
-    found = sweep(_loop, gains, plans, times, progress=progress, parameter="gain", measures=measures)
+    found = sweep(_swept_loop, gains, plans, times, progress=progress, parameter="gain", measures=measures)
     if found.interrupted:  # an incomplete sweep is not a result
         raise KeyboardInterrupt
     return found
