@@ -58,7 +58,7 @@ _JUMP = 1e-9
 _ROUNDINGS = 64.0
 """Rounding errors of a plan, in units of the last place of its largest values."""
 
-_FIRST, _LATER = 8.0, 4.0
+_FIRST, _LATER = 4.0, 2.0
 """Length of the first segment, and maximum length of others, as fractions of a run that an event may end."""
 
 SAMPLES = 5_000_000

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan.studies import PAPER, Study, linear_study
-from ctrlplan.studies.linear import _around_jumps, _shares, overshoot_peak
+from ctrlplan.studies.linear import _around_jumps, _shares, _swept_loop, overshoot_peak
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 TIMES = np.linspace(0.0, 20.0, 8001)
@@ -248,3 +248,12 @@ def test_progress_goes_to_stderr_or_nowhere(capsys):
     said = capsys.readouterr()
     assert said.out == ""
     assert "gain" in said.err
+
+
+@pytest.mark.parametrize("gain", [0.25, 5.0, 1000.0])
+def test_the_swept_loop_is_that_of_the_comparison(gain):
+    swept, loop = _swept_loop(gain), cp.plants.integrator_lag_loop(gain, outputs=("y", "u"))
+    for name in "ABCD":
+        np.testing.assert_allclose(getattr(swept, name), getattr(loop, name), rtol=1e-15, atol=1e-15 * gain)
+    assert swept.input_labels == loop.input_labels
+    assert swept.output_labels == loop.output_labels
