@@ -15,7 +15,7 @@ import ctrlplan
 from ctrlplan._checks import checked_params, real_array
 from ctrlplan._display import Displayed, Facts, Part, counted, time_text, title_of
 from ctrlplan._types import Array, Params
-from ctrlplan.simulation import Event
+from ctrlplan.simulation import Event, Prepared
 from ctrlplan.simulation.built_forms import shared_forms
 from ctrlplan.studies.alike import Linear, Together, numbers_of
 from ctrlplan.studies.checkpoint import digest
@@ -271,7 +271,8 @@ class Experiment(Displayed):
         if not is_builder(loop):
             check_has_inputs(loop)
         with shared_forms():  # loops built for the plans differ in their sources only
-            simulated, errors = _each(lambda name: self.simulated(loop, name), each_plan(list(self.plans)))
+            done: dict[Prepared, Run] = {}
+            simulated, errors = _each(lambda name: self.simulated(loop, name, done=done), each_plan(list(self.plans)))
             try:
                 metrics = dict(zip(simulated, self.metrics_of_runs(list(simulated.values())), strict=True))
             except Exception:  # of some of the plans
@@ -299,7 +300,9 @@ class Experiment(Displayed):
         run = self.simulated(loop, name, params)
         return run, self._metrics(run)
 
-    def simulated(self, loop: System | Builder, name: str, params: Params | None = None) -> Run:
+    def simulated(
+        self, loop: System | Builder, name: str, params: Params | None = None, done: dict[Prepared, Run] | None = None
+    ) -> Run:
         """Simulate a loop with one of the plans; arguments as for `run_plan`."""
         plan = self.plans[name]
         merged = self.params if params is None else {**(self.params or {}), **checked_params(params)}
@@ -315,6 +318,7 @@ class Experiment(Displayed):
             initial_state=self.initial_state,
             params=merged,
             events=self.events,
+            done=done,
         )
 
     def numbers_of(self, loop: System | Builder) -> Linear | None:

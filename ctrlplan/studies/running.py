@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeAlias, TypeGuard
 
 import control as ct
@@ -51,6 +52,7 @@ def run_plan(
     initial_state: ArrayLike | None = None,
     params: Params | None = None,
     events: Sequence[Event] | None = None,
+    done: dict[Prepared, Run] | None = None,
 ) -> Run:
     """Simulate a loop with a plan.
 
@@ -68,6 +70,9 @@ def run_plan(
         Labels of the outputs that follow the plan, if the loop has them.
     last : float
         Time of the last waypoint [s].
+    done : dict of Prepared to Run, optional
+        Runs at these times by their loop, to which this one is added. A loop without
+        inputs that a builder returns again, unchanged, is not simulated again.
 
     Warns
     -----
@@ -78,6 +83,8 @@ def run_plan(
     tracked, acting = _tracked(system, outputs, axes), acting_outputs(system, controls)
     with unchanged(system) as ready:
         check_reached(ready, tracked, plan)
+        if done and ready in done and not (ready.ninputs or done[ready].doubt):
+            return replace(done[ready], plan=plan, last=last)
         state, doubt = initial_state, ""
         if state is None and times.ndim == 1 and times.size and np.isfinite(times).all():  # otherwise simulate raises
             check_begin(ready.starts, float(times[0]), True)
@@ -94,7 +101,10 @@ def run_plan(
     if doubt:
         warnings.warn(doubt, UserWarning, stacklevel=outside_stacklevel())
     stop = stop if response.time[-1] < times[-1] else None
-    return Run(plan, system, response, tracked, acting, last, _unstable(ready), doubt, stop, _held(system, held))
+    run = Run(plan, system, response, tracked, acting, last, _unstable(ready), doubt, stop, _held(system, held))
+    if done is not None:
+        done[ready] = run
+    return run
 
 
 def _held(system: Prepared, held: HeldOutputs | None) -> dict[str, Held]:
