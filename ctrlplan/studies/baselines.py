@@ -71,10 +71,11 @@ def baseline_plans(
 
 def are_equal(one: Trajectory, other: Trajectory) -> bool:
     """Whether two plans have the same motion, to 1e-9 of its largest position."""
-    if (one.start, one.end) != (other.start, other.end):
+    if one.naxes != other.naxes or (one.start, one.end) != (other.start, other.end):
         return False
     t = np.linspace(one.start, one.end, 101)
-    return bool(np.abs(one.jet(t, 0) - other.jet(t, 0)).max() <= 1e-9 * np.abs(other.jet(t, 0)).max())
+    motions = [np.column_stack([plan.initial, plan.jet(t, 0)[0], plan.final]) for plan in (one, other)]
+    return bool(np.abs(motions[0] - motions[1]).max() <= 1e-9 * np.abs(motions[1]).max())
 
 
 def profiles(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -17,14 +17,14 @@ from ctrlplan._types import Array
 from ctrlplan.planning.bounds import limit_words
 from ctrlplan.planning.limits import Limited
 from ctrlplan.planning.quantities import System as Quantified
-from ctrlplan.simulation import state_space
+from ctrlplan.simulation import Prepared, state_space
 from ctrlplan.simulation.analytic_segments import spacing
 from ctrlplan.simulation.built_forms import shared_forms
 from ctrlplan.studies.baselines import are_equal, baseline_plans, derivative_limits, peak_limits, profiles
 from ctrlplan.studies.comparison import Comparison, comparison_of, finite_or_none
 from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.grids import Grid
-from ctrlplan.studies.measures import MEASURES, Chosen, Measure
+from ctrlplan.studies.measures import MEASURES, Chosen, Measure, Run
 from ctrlplan.studies.required_durations import RequiredDuration, required_duration, sentence_of
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import Builder, System, is_builder
@@ -278,6 +278,8 @@ class _Setting:
         The polynomial through the waypoints.
     alpha : float
         Shape parameter of the planned reference [rad].
+    done : dict of Prepared to Run
+        Runs at the times of the experiment by their loop.
     """
 
     experiment: Experiment
@@ -287,6 +289,7 @@ class _Setting:
     shaper: Shaper | None
     reference: PolySpline
     alpha: float
+    done: dict[Prepared, Run] = field(default_factory=dict)
 
     def baselines(self, points: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
         """Baselines of the planned reference."""
@@ -298,14 +301,19 @@ class _Setting:
     ) -> tuple[Experiment, Measured]:
         """Run plans through waypoints."""
         experiment, loop = self._experiment(points, plans, measures)
-        return experiment, experiment.run(loop)
+        return experiment, self._run(experiment, loop)
 
     def measured(self, points: tuple[Waypoint, ...], plans: dict[str, Trajectory], measures: Chosen) -> Measured:
         """Metrics of the same, without runs where a linear loop is solved with all plans."""
         experiment, loop = self._experiment(points, plans, measures)
         alike = None if is_builder(loop) else experiment.run_alike([loop])
         solved = alike[0] if alike else None
-        return experiment.run(loop) if solved is None else solved
+        return self._run(experiment, loop) if solved is None else solved
+
+    def _run(self, experiment: Experiment, loop: System | Builder) -> Measured:
+        """Runs of an experiment; those of loops that ran at the same times are known."""
+        same = np.array_equal(experiment.timepts, self.experiment.timepts)
+        return experiment.run(loop, self.done if same else None)
 
     def _experiment(
         self, points: tuple[Waypoint, ...], plans: dict[str, Trajectory], measures: Chosen

@@ -33,6 +33,8 @@ from ctrlplan.studies.crane_setup import (
     TORQUE_LIMITS,
     UNITS,
     WALL,
+    DriveLimits,
+    LoopsOfPlans,
     nominal_waypoints,
     obstacle_waypoints,
 )
@@ -52,11 +54,13 @@ _POLYLINE = "polyline (lower bound)"
 
 def nominal_benefit() -> Benefit:
     """The nominal move compared with its baselines; sufficiently smooth plans use the flat map."""
+    loops = LoopsOfPlans()
 
     def build(name: str, plan: Trajectory) -> ct.InterconnectedSystem:
         # The flat map contains accelerations: if these jump, so do the references of trolley and rope.
         law = LAWS["setpoint" if plan.jumps(2) else "generator"]
-        return crane_loop(CRANE, plan, law, force_limits=FORCE_LIMITS, torque_limits=TORQUE_LIMITS)
+        limits = DriveLimits(force_limits=FORCE_LIMITS, torque_limits=TORQUE_LIMITS)
+        return loops.loop(plan, None, lambda: crane_loop(CRANE, plan, law, **limits))  # a step is that of any duration
 
     points = nominal_waypoints()
     depth = float(np.mean([point.position[1] for point in points]))

@@ -15,7 +15,6 @@ from ctrlplan.planning.objectives import plan_lengths
 from ctrlplan.simulation import simulate
 from ctrlplan.simulation.built_forms import shared_forms
 from ctrlplan.simulation.simulate import simulate_for_metrics
-from ctrlplan.studies.baselines import are_equal
 from ctrlplan.studies.choosing import (
     LOAD_RADIUS,
     MARGIN,
@@ -38,6 +37,7 @@ from ctrlplan.studies.crane_setup import (
     UNITS,
     WALL,
     DriveLimits,
+    LoopsOfPlans,
     first_order_waypoints,
     marked_slack,
     nominal_waypoints,
@@ -261,15 +261,11 @@ def _compared(
 ) -> Comparison:
     timepts = np.union1d(np.linspace(0.0, t_end, int(100 * t_end) + 1), [w.time for w in points])
 
-    built: list[tuple[Trajectory, _Loop, ct.InterconnectedSystem]] = []
+    loops = LoopsOfPlans()
 
     def build(name: str, plan: Trajectory) -> ct.InterconnectedSystem:
-        options = plans[name][1]
-        for other, others, loop in built:
-            if others == options and are_equal(plan, other):  # with two waypoints a piecewise spline is the polynomial
-                return loop
-        built.append((plan, options, crane_loop(CRANE, plan, **options)))
-        return built[-1][2]
+        options = plans[name][1]  # a piecewise spline with two waypoints is the polynomial
+        return loops.loop(plan, options, lambda: crane_loop(CRANE, plan, **options))
 
     laws = {id(plan): options for plan, options in plans.values()}
     limited_errors: dict[int, float] = {}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import TypedDict
 
 import control as ct
@@ -11,6 +13,7 @@ from ctrlplan import metrics
 from ctrlplan._types import Array
 from ctrlplan.planning import plan_length
 from ctrlplan.simulation import Event
+from ctrlplan.studies.baselines import are_equal
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.measures import Measure, signals_of
 from ctrlplan.systems.plants import Crane
@@ -82,6 +85,23 @@ def obstacle_waypoints(duration: float = 16.0) -> tuple[Waypoint, ...]:
         Waypoint.from_jets(11.0, x=[15.0, 2.0, 0.1], z=[5.0, 1.0, 1.0]),
         Waypoint.from_jets(duration, x=[20.0, 0.0, 0.0], z=[11.0, 0.0, 0.0]),
     )
+
+
+@dataclass(frozen=True)
+class LoopsOfPlans:
+    """Loops that contain their plan, built once for equal plans."""
+
+    _built: list[tuple[Trajectory, object, ct.InterconnectedSystem]] = field(default_factory=list)
+
+    def loop(
+        self, plan: Trajectory, options: object, build: Callable[[], ct.InterconnectedSystem]
+    ) -> ct.InterconnectedSystem:
+        """Loop of a plan, that of an equal plan with equal options if there is one."""
+        for other, others, loop in self._built:
+            if others == options and are_equal(plan, other):
+                return loop
+        self._built.append((plan, options, build()))
+        return self._built[-1][2]
 
 
 def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -> dict[str, float]:

@@ -250,13 +250,15 @@ class Experiment(Displayed):
             "measures": list(measures),
         }
 
-    def run(self, loop: System | Builder) -> Measured:
+    def run(self, loop: System | Builder, done: dict[Prepared, Run] | None = None) -> Measured:
         """Simulate a loop with every plan, and compute the metrics.
 
         Parameters
         ----------
         loop : control system or callable
             As for `compare`.
+        done : dict of Prepared to Run, optional
+            As for `run_plan`, if other runs have the same times.
 
         Returns
         -------
@@ -271,8 +273,8 @@ class Experiment(Displayed):
         if not is_builder(loop):
             check_has_inputs(loop)
         with shared_forms():  # loops built for the plans differ in their sources only
-            done: dict[Prepared, Run] = {}
-            simulated, errors = _each(lambda name: self.simulated(loop, name, done=done), each_plan(list(self.plans)))
+            known = {} if done is None else done
+            simulated, errors = _each(lambda name: self.simulated(loop, name, done=known), each_plan(list(self.plans)))
             try:
                 metrics = dict(zip(simulated, self.metrics_of_runs(list(simulated.values())), strict=True))
             except Exception:  # of some of the plans

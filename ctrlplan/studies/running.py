@@ -83,8 +83,9 @@ def run_plan(
     tracked, acting = _tracked(system, outputs, axes), acting_outputs(system, controls)
     with unchanged(system) as ready:
         check_reached(ready, tracked, plan)
-        if done and ready in done and not (ready.ninputs or done[ready].doubt):
-            return replace(done[ready], plan=plan, last=last)
+        known = done.get(ready) if done else None
+        if known is not None and not known.doubt:
+            return replace(known, plan=plan, last=last)
         state, doubt = initial_state, ""
         if state is None and times.ndim == 1 and times.size and np.isfinite(times).all():  # otherwise simulate raises
             check_begin(ready.starts, float(times[0]), True)
@@ -102,7 +103,7 @@ def run_plan(
         warnings.warn(doubt, UserWarning, stacklevel=outside_stacklevel())
     stop = stop if response.time[-1] < times[-1] else None
     run = Run(plan, system, response, tracked, acting, last, _unstable(ready), doubt, stop, _held(system, held))
-    if done is not None:
+    if done is not None and not ready.ninputs:
         done[ready] = run
     return run
 
