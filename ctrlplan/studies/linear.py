@@ -159,7 +159,7 @@ def _swept_loop(gain: float) -> ct.StateSpace:
 def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
     """Sweep over the gain, refined between gains where a settling time jumps, or changes steeply.
 
-    Most jumps are known before the sweep; it finds the others.
+    Nearly all jumps are known before the sweep; it finds the others.
     """
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
     base = np.union1d(np.geomspace(*GAINS, count // 2), list(NUMBERED["step"]))
