@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.simulation.budget import check
+from ctrlplan.simulation.built_forms import NotApplicableError
 from ctrlplan.simulation.delayed_signals import DelayedSignal, HeldDelaySignal
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.known_delays import KnownDelaySignal
@@ -191,10 +192,10 @@ def integrate(
         grid, requested = memory.grid(left, right, inside[1:] if inside.size and inside[0] <= left else inside)
         try:
             states = _advanced(solver, series, left, grid, x, last)
-        except SolverError:
+        except (SolverError, ArithmeticError, ValueError) as error:
             if ended := _ended(found.run(left, x), stops):
                 return ended
-            if right - left < shortest:
+            if right - left < shortest or not _may_be_later(error, stops):
                 raise
             reach = 0.5 * (right - left)
             continue
@@ -329,6 +330,11 @@ def _reached(times: Array, left: float, reach: float) -> float:
     """
     before = float(times[np.searchsorted(times, left + reach * (1.0 + 1e-9), side="right") - 1])
     return before if before > left + 0.5 * reach else left + reach
+
+
+def _may_be_later(error: Exception, stops: Stops | None) -> bool:
+    """Whether an error in a segment may be absent in a shorter one; a block may be undefined after an event."""
+    return isinstance(error, SolverError) or (stops is not None and not isinstance(error, NotApplicableError))
 
 
 def _ended(run: NetworkRun, stops: Stops | None) -> NetworkRun | None:

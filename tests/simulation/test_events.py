@@ -289,6 +289,24 @@ def test_a_stop_before_the_solution_ends(level, method):
     assert np.abs(found.outputs.ravel()[:2] - [1.0, 4 / 3]).max() <= 1e-6
 
 
+@pytest.mark.parametrize("error", [ValueError, ZeroDivisionError])
+@pytest.mark.parametrize("end", [1.5, 3.0, 40.0])
+def test_a_block_may_be_undefined_after_a_stop(error, end):
+    """x' = 1; the block raises an error above 1.2."""
+
+    def rate(t, x, u, params):
+        if x[0] > 1.2:
+            raise error("the model is not valid here")
+        return np.ones(1)
+
+    ramp, times = ct.nlsys(rate, lambda t, x, u, params: x, outputs="y", states=1, inputs=0), np.linspace(0.0, end, 401)
+    found = cp.simulate(ramp, times, events=[Event("y", high=1.0, stop=True)])
+    assert found.time[-1] == pytest.approx(1.0, abs=1e-7)
+    for events in ([], [Event("y", high=2.0, stop=True)], [Event("y", high=1.0)]):
+        with pytest.raises(error, match="not valid here"):
+            cp.simulate(ramp, times, events=events)
+
+
 def test_a_stop_of_an_unstable_loop_that_leaves_the_range_of_numbers():
     # x = exp(1000 t) is infinite from 0.71 s on.
     unstable = ct.ss(1000.0, 1.0, 1.0, 0.0, outputs="y")
