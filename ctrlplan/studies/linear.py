@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache, reduce
+from functools import lru_cache
 
 import control as ct
 import numpy as np
@@ -165,10 +165,8 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
     base = np.union1d(np.geomspace(*GAINS, count // 2), list(NUMBERED["step"]))
     own = np.union1d(base[base < DENSE], [*NUMBERED["step"], GAINS[1]])
     gains = np.union1d(own, _around_jumps(np.union1d(even, base), finest))
-    every = _strides(gains)
     plans = linear_plans()
-    groups = [(gains[every == k], k) for k in np.unique(every).tolist()]
-    found = reduce(Sweep.merged, (_swept(some, plans, SWEPT, k, progress) for some, k in groups))
+    found = _swept(gains, plans, SWEPT, progress)
     while True:
         settling = [rows["settling_time"] for rows in found.metrics.values()]
         jump, steep = (np.any([settling_jumps(found.values, r, s) for r in settling], axis=0) for s in (3.0, 1.5))
@@ -177,26 +175,15 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
         if parts.max() == 1:
             return found
         gains = np.setdiff1d(_divided(found.values, parts), found.values)
-        found = found.merged(_swept(gains, plans, SWEPT, int(_strides(gains).min()), progress))
+        found = found.merged(_swept(gains, plans, SWEPT, progress))
 
 
-def _swept(gains: Array, plans: dict[str, Trajectory], measures: tuple[str, ...], every: int, progress: bool) -> Sweep:
-    """Metrics at gains, from every so many of the sample times."""
-    times = TIMEPTS[::every]
-    found = sweep(_swept_loop, gains, plans, times, progress=progress, parameter="gain", measures=measures)
+def _swept(gains: Array, plans: dict[str, Trajectory], measures: tuple[str, ...], progress: bool) -> Sweep:
+    """Metrics at gains."""
+    found = sweep(_swept_loop, gains, plans, TIMEPTS, progress=progress, parameter="gain", measures=measures)
     if found.interrupted:  # an incomplete sweep is not a result
         raise KeyboardInterrupt
     return found
-
-
-def _strides(gains: Array) -> NDArray[np.intp]:
-    """Intervals between samples of the sweep, in those of `TIMEPTS`: 1, 2 or 4.
-
-    The loop oscillates with the square root of the gain: a gain of a fourth has as many
-    samples in a period at half of the times. Metrics are then as accurate as at the
-    highest gain, to a few 1e-6 of their value.
-    """
-    return 2 ** np.clip(np.floor(0.5 * np.log2(GAINS[1] / gains)), 0.0, 2.0).astype(np.intp)
 
 
 def _parts(gains: Array, widest: ArrayLike) -> NDArray[np.intp]:
@@ -337,7 +324,7 @@ def overshoot_peak(gains: Array, overshoot: Array) -> tuple[float, float]:
     plan = linear_plans()["trigonometric"]
 
     def overshoot_at(frequency: Array) -> Array:
-        found = _swept(frequency**2, {"it": plan}, ("overshoot_error",), int(_strides(frequency**2).min()), False)
+        found = _swept(frequency**2, {"it": plan}, ("overshoot_error",), progress=False)
         return found.metrics["it"]["overshoot_error"]
 
     frequency, values = np.sqrt(gains), overshoot
