@@ -233,8 +233,8 @@ def _changes(a: Array, b: Array, segments: Sequence[AnalyticSegment]) -> list[_C
         times = np.array([part * s.h for _, s, part in group])[:, None, None, None]
         nterms = max(s.nterms for _, s, _ in group)
         halvings = max(s.per.bit_length() - 1 if part == 1.0 else 0 for _, s, part in group)
-        flat = (times * a).reshape(-1, n, n), (times * b).reshape(-1, n, m)
-        levels = [level.reshape(len(group), count, n, -1) for level in changes_over(*flat, nterms, halvings)]
+        flat_a, flat_b = ((times * x).reshape(len(group) * count, *x.shape[1:]) for x in (a, b))
+        levels = [level.reshape(len(group), count, n, -1) for level in changes_over(flat_a, flat_b, nterms, halvings)]
         for i, (k, s, part) in enumerate(group):
             found[k][part] = [level[i, ..., : n + s.nterms * m] for level in levels]
     return found

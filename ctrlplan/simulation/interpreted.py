@@ -518,7 +518,7 @@ def _merged_linear(network: Network) -> tuple[Array, Array, NDArray[np.intp], ND
     b = np.zeros((states.size, network.nsignals))
     if linear:
         inputs = [np.asarray(network.blocks[i].system.B) @ network.wire[network.inputs[i]] for i in linear]
-        b = np.concatenate([part.reshape(-1, network.nsignals) for part in inputs])
+        b = np.concatenate(inputs).reshape(states.size, network.nsignals)  # also without states or signals
     others = [
         i
         for i, (block, rows) in enumerate(zip(network.blocks, network.states, strict=True))

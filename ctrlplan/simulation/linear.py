@@ -250,7 +250,7 @@ def stacked_form(systems: Sequence[LinearParts]) -> LinearForm:
     counts = [block.ninputs for block in first.blocks]
     names = [block.name for block in first.blocks]
     connect, external, outputs = first.matrices
-    return closed(forms, counts, names, connect, external.reshape(sum(counts), -1), outputs, first.name)
+    return closed(forms, counts, names, connect, external.reshape(sum(counts), first.ninputs), outputs, first.name)
 
 
 def in_right_half(poles: NDArray[np.inexact]) -> NDArray[np.bool_]:

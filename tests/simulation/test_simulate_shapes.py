@@ -1,5 +1,6 @@
 """Shapes, labels and order of the response: those of python-control's own input_output_response."""
 
+import itertools
 from functools import cache
 
 import control as ct
@@ -189,3 +190,37 @@ def test_a_system_of_states_alone(method):
     found = cp.simulate(system, times, None, [1.0], method=method)
     assert found.outputs.shape == found.inputs.shape == (0, times.size)
     assert np.abs(found.states[0] - 1.0 / (1.0 + times)).max() <= 1e-6 * np.ptp(found.states[0])
+
+
+@pytest.mark.every_combination
+@pytest.mark.parametrize("timepts", [np.linspace(0.0, 1.0, 50), [0.0, 0.1, 0.35, 1.0]], ids=["even", "uneven"])
+@pytest.mark.parametrize(("nstates", "ninputs", "noutputs"), list(itertools.product((0, 3), (0, 1, 2), (0, 2))))
+@pytest.mark.parametrize("method", ["auto", "exact", "compiled", "python"])
+def test_any_number_of_signals_may_be_zero(nstates, ninputs, noutputs, method, timepts):
+    """x' = -x + sum(u) with a constant input of one: closed form, also where nothing is left to compute."""
+    d = np.arange(1.0, noutputs * ninputs + 1.0).reshape(noutputs, ninputs)
+    system = ct.ss(-np.eye(nstates), np.ones((nstates, ninputs)), np.ones((noutputs, nstates)), d, 0)
+    for inputs in (1.0, np.ones((ninputs, len(timepts)))):
+        response = cp.simulate(system, timepts, inputs, np.arange(1.0, nstates + 1.0), method=method)
+        decay = np.exp(-np.asarray(timepts))
+        states = ninputs * (1.0 - decay) + np.arange(1.0, nstates + 1.0)[:, None] * decay
+        np.testing.assert_allclose(response.states, states, rtol=1e-6)
+        outputs = states.sum(axis=0) + np.repeat(d.sum(axis=1)[:, None], decay.size, axis=1)
+        np.testing.assert_allclose(response.outputs, outputs, rtol=1e-6)
+
+
+@pytest.mark.parametrize("linear", [True, False])
+def test_discrete_systems_without_any_signal(linear):
+    system = ct.ss([], [], [], [], 0.5) if linear else ct.nlsys(None, lambda t, x, u, p: u, inputs=0, outputs=0, dt=0.5)
+    response = cp.simulate(system, [0.0, 0.5, 1.0])
+    assert response.states.shape == (0, 3)
+    assert np.shape(response.outputs) == (0, 3)
+
+
+def test_linear_blocks_without_inputs_in_a_loop_without_inputs():
+    """Two outputs that decay, passed on by an interconnection that has no input at all."""
+    free = ct.ss(-np.eye(2), np.zeros((2, 0)), np.eye(2), np.zeros((2, 0)), outputs=["y", "z"], name="free")
+    loop = ct.interconnect([free], connections=False, outlist=["free.y", "free.z"], outputs=["y", "z"])
+    for method in ("auto", "exact", "compiled", "python"):
+        response = cp.simulate(loop, T, initial_state=[1.0, 2.0], method=method)
+        np.testing.assert_allclose(response.outputs, np.outer([1.0, 2.0], np.exp(-T)), rtol=1e-6)

@@ -86,7 +86,7 @@ def _sampling_instants(times: Array, dt: float | bool, width: int) -> Array:
             f"timepts must resolve sample times {period:g} s apart, got times up to {np.abs(times).max():g} s"
         )
     steps = (times - times[0]) / period
-    most = min(_MAX_STEPS, _MAX_VALUES / width)
+    most = min(_MAX_STEPS, _MAX_VALUES / max(1, width))
     if steps[-1] > most:
         raise ValueError(
             f"timepts must span at most {most:.3g} periods of a discrete system, got {steps[-1]:.3g}, since {width} "
