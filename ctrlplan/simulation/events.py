@@ -247,6 +247,13 @@ def crossings(
             yield Occurrence(time, watched.name, _KINDS[right], watched.stop and right != 0)
 
 
+def first_stop(watched: Iterable[Watched], seen: Snapshot) -> int | None:
+    """Index of the first time at which an event that ends the run has occurred; None if there is none."""
+    beyond = [entry.side(entry.value(seen)) != 0 for entry in watched if entry.stop]
+    where = np.flatnonzero(np.any(beyond, axis=0)) if beyond else np.zeros(0, dtype=np.intp)
+    return int(where[0]) if where.size else None
+
+
 def departures_of(
     watched: Watched, times: Array, values: Array, value_at: Callable[[int, float], float]
 ) -> list[Departures]:

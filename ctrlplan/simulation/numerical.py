@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.simulation.budget import TimeLimitError
-from ctrlplan.simulation.events import Snapshot, Watched
+from ctrlplan.simulation.events import Snapshot, Watched, first_stop
 from ctrlplan.simulation.held_outputs import HeldOutputs
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.job import Job, Record, fresh_job, with_event_times
@@ -455,8 +455,8 @@ class Attempt(Generic[S]):
 
     def _stop_of(self, seen: Snapshot) -> int | None:
         """Index of the first time, after that of the start, by which an event that ends a run has occurred."""
-        beyond = np.any([entry.side(entry.value(seen)) != 0 for entry in self.watched if entry.stop], axis=0)
-        return max(1, int(beyond.argmax())) if beyond.any() else None
+        stop = first_stop(self.watched, seen)
+        return None if stop is None else max(1, stop)
 
     def _initial_slope(self) -> Array:
         """Jacobian by the states at the start of the run; nan where blocks raise."""

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
-from ctrlplan.simulation.budget import check
+from ctrlplan.simulation.budget import TimeLimitError, check
 from ctrlplan.simulation.built_forms import NotApplicableError
 from ctrlplan.simulation.delayed_signals import DelayedSignal, HeldDelaySignal
-from ctrlplan.simulation.interpreted import Interpreted, SolverError
+from ctrlplan.simulation.interpreted import FeedthroughError, Interpreted, SolverError
 from ctrlplan.simulation.known_delays import KnownDelaySignal
 from ctrlplan.simulation.network import Block, Network
 from ctrlplan.simulation.scales import in_turn
@@ -192,7 +192,8 @@ def integrate(
         grid, requested = memory.grid(left, right, inside[1:] if inside.size and inside[0] <= left else inside)
         try:
             states = _advanced(solver, series, left, grid, x, last)
-        except (SolverError, ArithmeticError, ValueError) as error:
+            stopped = stops is not None and stops.within(series, grid, states)
+        except Exception as error:
             if ended := _ended(found.run(left, x), stops):
                 return ended
             if right - left < shortest or not _may_be_later(error, stops):
@@ -205,11 +206,11 @@ def integrate(
         schedule.add(memory.jumps)
         found.add(series, left, x, grid[requested], states[:, requested])
         x = states[:, -1]
+        if stopped and (ended := _ended(found.run(right, x), stops)):
+            return ended
         if ends or right < last:
             x = schedule.sample(equations, right, x)
         left, reach = right, min(longest, 2.0 * reach)
-        if stops is not None and stops.within(series, grid, states) and (ended := _ended(found.run(left, x), stops)):
-            return ended
     return found.run(left, x)
 
 
@@ -334,7 +335,8 @@ def _reached(times: Array, left: float, reach: float) -> float:
 
 def _may_be_later(error: Exception, stops: Stops | None) -> bool:
     """Whether an error in a segment may be absent in a shorter one; a block may be undefined after an event."""
-    return isinstance(error, SolverError) or (stops is not None and not isinstance(error, NotApplicableError))
+    lasting = NotApplicableError, FeedthroughError, TimeLimitError
+    return isinstance(error, SolverError) or (stops is not None and not isinstance(error, lasting))
 
 
 def _ended(run: NetworkRun, stops: Stops | None) -> NetworkRun | None:

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import ctrlplan as cp
-from ctrlplan.simulation import Event, Occurrence
+from ctrlplan.simulation import Event, Occurrence, budget
 from ctrlplan.simulation.events import Departures, Watched, crossings
 from ctrlplan.simulation.response import departures_in
 from ctrlplan.simulation.simulate import simulate_for_metrics
@@ -305,6 +305,69 @@ def test_a_block_may_be_undefined_after_a_stop(error, end):
     for events in ([], [Event("y", high=2.0, stop=True)], [Event("y", high=1.0)]):
         with pytest.raises(error, match="not valid here"):
             cp.simulate(ramp, times, events=events)
+
+
+class OutsideOfModelError(Exception):
+    """Raised by blocks outside of the range of their model."""
+
+
+def defined_up_to(limit, value):
+    if value > limit:
+        raise OutsideOfModelError("the model is not valid here")
+    return value
+
+
+def ramp_and(*blocks, dt=0):
+    """y' = 1, or steps of dt."""
+    rate = (lambda t, x, u, p: x + dt) if dt else (lambda t, x, u, p: np.ones(1))
+    ramp = ct.nlsys(rate, lambda t, x, u, p: x, outputs="y", states=1, inputs=0, dt=dt, name="ramp")
+    return ct.interconnect([ramp, *blocks], inputs=[], outputs=["y", "v"], inplist=[], outlist=["y", "v"])
+
+
+def reading(t, x, u, params):
+    return [defined_up_to(1.2, u[0])]
+
+
+def output_of(source, dt=0):
+    return ct.nlsys(None, reading, inputs=source, outputs="v", dt=dt, name="block")
+
+
+def update_of(source, dt):
+    return ct.nlsys(reading, lambda t, x, u, p: x, inputs=source, outputs="v", states=1, dt=dt, name="block")
+
+
+READERS = {
+    "output": ramp_and(output_of("y")),
+    "output of a sampled block": ramp_and(cp.sample_hold(output_of("y", 0.25), 0.25)),
+    "update of a sampled block": ramp_and(cp.sample_hold(update_of("y", 0.25), 0.25)),
+    "delayed": ramp_and(cp.create_delay_iosystem(0.05, inputs="y", outputs="w"), output_of("w")),
+    "output in a discrete loop": ramp_and(output_of("y", 0.03125), dt=0.03125),
+    "update in a discrete loop": ramp_and(update_of("y", 0.03125), dt=0.03125),
+}
+
+
+@pytest.mark.parametrize("method", ["auto", "python"])
+@pytest.mark.parametrize("name", READERS)
+def test_any_block_may_be_undefined_after_a_stop(name, method):
+    """y = t leaves its limits at 1.01 or at the sample after it; the block is undefined above 1.2."""
+    times = np.linspace(0.0, 10.0, 321)
+    found = cp.simulate(READERS[name], times, events=[Event("y", high=1.01, stop=True)], method=method)
+    assert found.time[-1] == pytest.approx(1.03125 if "discrete" in name else 1.01, abs=1e-7)
+    assert found.outputs[0] == pytest.approx(found.time, abs=1e-7)
+    with pytest.raises(OutsideOfModelError, match="not valid here"):
+        cp.simulate(READERS[name], times, events=[Event("y", high=4.0, stop=True)], method=method)
+
+
+@pytest.mark.parametrize("method", ["auto", "python"])
+@pytest.mark.parametrize("dt", [0, 0.5])
+def test_a_time_limit_holds_in_runs_that_may_stop(method, dt):
+    def slow(t, x, u, params):
+        budget.check(t)
+        return -x
+
+    loop = ct.nlsys(slow, lambda t, x, u, p: x, inputs=0, outputs=["y"], states=1, dt=dt)
+    with pytest.raises(budget.TimeLimitError), budget.time_limit(0.0):
+        cp.simulate(loop, np.linspace(0.0, 5.0, 11), None, 1.0, events=[Event("y", low=0.5, stop=True)], method=method)
 
 
 def test_a_stop_of_an_unstable_loop_that_leaves_the_range_of_numbers():

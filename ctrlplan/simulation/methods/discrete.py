@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ctrlplan._types import Array
-from ctrlplan.simulation.budget import check
-from ctrlplan.simulation.events import Snapshot
+from ctrlplan.simulation.budget import TimeLimitError, check
+from ctrlplan.simulation.events import Snapshot, first_stop
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.job import Job, Record
 from ctrlplan.simulation.prepared import Prepared
@@ -50,20 +50,31 @@ class Discrete:
         states = np.empty((job.state.size, instants.size))
         signals = np.empty((network.nsignals, instants.size))
         states[:, 0] = job.state
-        for k, t in enumerate(instants.tolist()):
-            check(t)
-            signals[:, k] = equations.signals(t, states[:, k], values[:, k])
-            following = equations.rates_of(t, states[:, k], signals[:, k])
-            if k + 1 < instants.size:
-                states[:, k + 1] = following
 
         def snapshot(t: Array, x: Array) -> Snapshot:
             now = signal_values(time_signals, _on_breakpoints(t, breakpoints))
             w = signals[:, np.searchsorted(instants, t, side="right") - 1]
             return Snapshot(t, x, now[: prepared.ninputs], lambda: network.to_outputs(w), lambda: w)
 
+        watched, count = job.watched(), 0  # times with known signals
+        try:
+            for k, t in enumerate(instants.tolist()):
+                check(t)
+                signals[:, k] = equations.signals(t, states[:, k], values[:, k])
+                count = k + 1
+                following = equations.rates_of(t, states[:, k], signals[:, k])
+                if count < instants.size:
+                    states[:, count] = following
+        except TimeLimitError:
+            raise
+        except Exception:  # a block may be undefined after an event that ends the run
+            if not count or first_stop(watched, snapshot(instants[:count], states[:, :count])) is None:
+                raise
+
         # Signals are constant between samples: a limit is crossed at the later one.
-        return Record(instants, states, snapshot, lambda k, t: states[:, k], job.watched(), self.name, job.reason)
+        return Record(
+            instants[:count], states[:, :count], snapshot, lambda k, t: states[:, k], watched, self.name, job.reason
+        )
 
 
 def _sampling_instants(times: Array, dt: float | bool, width: int) -> Array:
