@@ -307,6 +307,23 @@ def test_a_block_may_be_undefined_after_a_stop(error, end):
             cp.simulate(ramp, times, events=events)
 
 
+def test_a_discrete_run_ends_soon_after_a_stop():
+    """A counter: blocks are evaluated at most 128 samples after the event."""
+    calls = []
+
+    def count(t, x, u, params):
+        calls.append(t)
+        return x + 1.0
+
+    counter = ct.nlsys(count, lambda t, x, u, params: x, inputs=0, outputs="y", states=1, dt=1.0)
+    for high in (-1.0, 0.5, 126.5, 127.5, 500.0):
+        calls.clear()
+        found = cp.simulate(counter, np.arange(3000.0), events=[Event("y", high=high, stop=True)])
+        end = max(0.0, math.floor(high) + 1.0)
+        assert found.time[-1] == found.outputs[0, -1] == end
+        assert len(calls) <= end + 129
+
+
 class OutsideOfModelError(Exception):
     """Raised by blocks outside of the range of their model."""
 

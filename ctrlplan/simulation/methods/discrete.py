@@ -18,6 +18,9 @@ _MAX_STEPS = 1e8
 _MAX_VALUES = 5e8
 """Maximum number of states and signals at all steps, which are stored: 4 GB."""
 
+_TOGETHER = 128
+"""Number of samples that are searched together for an event that ends the run."""
+
 _OFF_INSTANT = 1e-5
 """Fraction of the sampling time by which a time may differ from a sample time, in addition to rounding."""
 
@@ -57,18 +60,26 @@ class Discrete:
             return Snapshot(t, x, now[: prepared.ninputs], lambda: network.to_outputs(w), lambda: w)
 
         watched, count = job.watched(), 0  # times with known signals
+        stops = any(entry.stop for entry in watched)
+
+        def has_stopped(begin: int) -> bool:
+            """Whether an event that ends the run has occurred at the last times, from an index on."""
+            return first_stop(watched, snapshot(instants[begin:count], states[:, begin:count])) is not None
+
         try:
             for k, t in enumerate(instants.tolist()):
                 check(t)
                 signals[:, k] = equations.signals(t, states[:, k], values[:, k])
                 count = k + 1
                 following = equations.rates_of(t, states[:, k], signals[:, k])
+                if stops and not count % _TOGETHER and has_stopped(count - _TOGETHER):
+                    break
                 if count < instants.size:
                     states[:, count] = following
         except TimeLimitError:
             raise
-        except Exception:  # a block may be undefined after an event that ends the run
-            if not count or first_stop(watched, snapshot(instants[:count], states[:, :count])) is None:
+        except Exception:  # a block may be undefined after the event
+            if not stops or not count or not has_stopped(count - 1 - (count - 1) % _TOGETHER):
                 raise
 
         # Signals are constant between samples: a limit is crossed at the later one.
