@@ -234,14 +234,13 @@ def crossings(
         stages = [(before, 0), (0, after)] if before * after < 0 else [(before, after)]
         for left, right in stages:
             level = watched.limit(left, right)
-            root = _root(
-                partial(_beyond, value_at, k, level),
-                float(times[k]),
-                float(times[k + 1]),
-                float(values[k]) - level,
-                float(values[k + 1]) - level,
-                _expected(times, values, k, level),
-            )
+            interval = float(times[k]), float(times[k + 1])
+            at_ends = float(values[k]) - level, float(values[k + 1]) - level
+            function = partial(_beyond, value_at, k, level)
+            if 0.0 in at_ends:
+                root = _root_from(function, *interval, *at_ends, level)
+            else:
+                root = _root(function, *interval, *at_ends, _expected(times, values, k, level))
             # Both limits may be within a rounding error of time.
             time = root if left == before else max(root, time)
             yield Occurrence(time, watched.name, _KINDS[right], watched.stop and right != 0)
@@ -349,8 +348,8 @@ def _root(
 
     It is first searched near an expected root with a slope.
     """
-    if at_left == 0.0 or at_left * at_right >= 0.0:
-        return left if at_left == 0.0 else right
+    if at_left * at_right >= 0.0:
+        return right
     crossed = [right]
     known = dict[float, float]()  # a value may differ by rounding when it is computed again
 
@@ -363,13 +362,38 @@ def _root(
                 crossed.append(t)
         return known[t]
 
-    size = max(abs(left), abs(right), right - left)
-    tolerance = 1e-12 * (right - left) + 1e-14 * size
+    tolerance = _tolerance(left, right)
     found, low, high = _near(value, (left, right), (at_left, at_right), *expected, tolerance)
     if found is not None:
         return found
     brentq(value, low, high, xtol=tolerance, rtol=1e-14)
     return min(crossed)
+
+
+def _root_from(
+    function: Callable[[float], float], left: float, right: float, at_left: float, at_right: float, level: float
+) -> float:
+    """The same for a signal that is on its limit, which is inside, at one end; it may be held there for some time.
+
+    The end itself, if the signal may have left it at once: a power of the time up to the sixth is not
+    distinguished from the limit before the root that is found.
+    """
+    leaves = at_left == 0.0
+    beyond, low, high = at_right if leaves else at_left, left, right
+    while high - low > _tolerance(left, right):
+        middle = 0.5 * (low + high)
+        if (function(middle) * beyond > 0.0) == leaves:
+            high = middle
+        else:
+            low = middle
+    part = (high - left if leaves else right - high) / (right - left)
+    is_held = abs(beyond) * part**6 > 16.0 * np.finfo(float).eps * max(abs(level), abs(beyond))
+    return high if is_held else left if leaves else right
+
+
+def _tolerance(left: float, right: float) -> float:
+    """Tolerance of a root in an interval of time [s]."""
+    return 1e-12 * (right - left) + 1e-14 * max(abs(left), abs(right), right - left)
 
 
 def _near(

@@ -307,6 +307,44 @@ def test_a_block_may_be_undefined_after_a_stop(error, end):
             cp.simulate(ramp, times, events=events)
 
 
+@pytest.mark.parametrize("level", [0.0, 1.0, -3.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_signal_at_rest_on_its_limit(method, sign, level):
+    """It is inside until it leaves, from 2.53 s to 4.53 s, and inside again at the end: between output times."""
+    plan = cp.PolySpline([cp.Waypoint(2.53 + k, level + sign * (k == 1), 0) for k in range(3)])
+    unit = ct.ss([], [], [], 1.0, inputs="r", outputs="y", name="unit")
+    limits = {"high": level} if sign > 0 else {"low": level}
+    found = cp.simulate(unit, T, plan, events=[Event("y", **limits)], method=method)
+    assert [one.kind for one in found.events] == ["above" if sign > 0 else "below", "inside"]
+    # Squares of times of 1e-7 s are the rounding errors of the values.
+    assert np.abs(times_of(found) - [2.53, 4.53]).max() <= (1e-11 if level == 0.0 else 1e-7)
+
+
+def test_a_signal_that_leaves_its_limit_at_an_output_time():
+    """It leaves zero upwards at 0 and downwards at 1 s, where it is on both limits."""
+    plan = cp.PolySpline([cp.Waypoint(0.0, 0, 1), cp.Waypoint(1.0, 0, -1), cp.Waypoint(2.0, 0, 1)])
+    unit = ct.ss([], [], [], 1.0, inputs="r", outputs="y", name="unit")
+    found = cp.simulate(unit, [0.0, 0.5, 1.0, 1.5, 2.0], plan, events=[Event("y", low=0.0), Event("y", high=0.0)])
+    assert np.abs(times_of(found) - [0.0, 1.0, 1.0, 2.0]).max() <= 1e-11
+
+
+def test_a_held_signal_leaves_its_limit_at_a_sample():
+    """A counter, and one that is sampled in a continuous loop: inside as long as it equals the limit."""
+    counter = ct.nlsys(lambda t, x, u, p: x + 1.0, lambda t, x, u, p: x, inputs=0, outputs="n", states=1, dt=0.25)
+    discrete = cp.simulate(counter, np.arange(0.0, 5.0, 0.25), events=[Event("n", high=5.0)])
+    assert told(discrete) == [("n", "above")]
+    assert times_of(discrete) == [1.5]
+    clock = ct.ss(0.0, 0.0, 1.0, 0.0, inputs="nothing", outputs="c", name="clock")
+    counting = ct.ss(1.0, 1.0, 1.0, 0.0, 0.25, inputs="c", outputs="n", name="counting")
+    loop = ct.interconnect([clock, cp.sample_hold(counting, 0.25)], inputs=["nothing"], outputs=["n"])
+    for method in ("auto", "python"):
+        held = cp.simulate(
+            loop, [0.0, 0.6, 1.1, 4.0], 0.0, [1.0, 0.0, 0.0], events=[Event("n", high=5.0)], method=method
+        )
+        assert times_of(held) == pytest.approx([1.5], abs=1e-10)
+
+
 def test_a_discrete_run_ends_soon_after_a_stop():
     """A counter: blocks are evaluated at most 128 samples after the event."""
     calls = []
