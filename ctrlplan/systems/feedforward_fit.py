@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -16,6 +17,7 @@ from scipy.optimize import brentq
 
 from ctrlplan._checks import check_kind, checked_labels, checked_names, real_array
 from ctrlplan._display import Displayed, Facts, Part, Table, number
+from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.systems.motion import FilteredColumn, Motion, PlannedMotion, SampledMotion
 from ctrlplan.systems.regression import LeastSquares, least_squares
@@ -68,6 +70,13 @@ _MOVES = {
 }
 """Moves that distinguish two terms."""
 _OTHER_MOVE = "moves over a wider range of positions, in both directions and at different speeds"
+
+
+_GAP, _LONG_GAP = 2.5, 10.0
+"""Intervals between samples, in median ones, that are gaps; and above which a single one may falsify the gains."""
+
+_MISSING = 0.05
+"""Fraction of the time in gaps above which confidence intervals are too narrow; at 3 % they hold."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -268,6 +277,13 @@ def fit_feedforward(
     TypeError
         If an argument has a wrong type.
 
+    Warns
+    -----
+    UserWarning
+        If there is no plan and samples are missing: a gap of more than 10 median
+        intervals, or gaps of more than 2.5 in more than 5 % of the time. Confidence
+        intervals do not allow for the interpolation there.
+
     Examples
     --------
     >>> import numpy as np
@@ -363,10 +379,20 @@ def _signals(log: ct.TimeResponseData) -> tuple[Array, dict[str, Array]]:
 
 
 def _evenly(t: Array, signals: Mapping[str, Array]) -> tuple[Array, dict[str, Array]]:
-    """Signals at even times, by linear interpolation where the log is uneven."""
+    """Signals at even times, by linear interpolation where the log is uneven; a warning if much is interpolated."""
     steps = np.diff(t)
     if np.ptp(steps) <= 1e-6 * np.median(steps):
         return t, dict(signals)
+    gaps = steps[steps > _GAP * np.median(steps)]
+    share = float(gaps.sum() / (t[-1] - t[0]))
+    if share > _MISSING or steps.max() > _LONG_GAP * np.median(steps):
+        warnings.warn(
+            f"a log without a plan should be evenly sampled, got gaps of up to {1e3 * steps.max():.3g} ms, "
+            f"{100.0 * share:.2g} % of the time: signals are interpolated there, and the intervals of the gains are "
+            "too narrow; give the plan, or fit a log without gaps",
+            UserWarning,
+            stacklevel=outside_stacklevel(),
+        )
     even = np.linspace(t[0], t[-1], round(float((t[-1] - t[0]) / np.median(steps))) + 1)
     return even, {name: np.interp(even, t, row) for name, row in signals.items()}
 

@@ -2,6 +2,7 @@
 
 import math
 import re
+import warnings
 
 import control as ct
 import numpy as np
@@ -156,8 +157,27 @@ def test_units_of_the_log_do_not_matter():
 
 def test_uneven_samples_of_positions():
     t = np.sort(np.random.default_rng(2).uniform(0.0, 10.0, 20000))
-    fit = cp.fit_feedforward(logged(t=t, seed=1, position=1e-5))
+    with pytest.warns(UserWarning, match="intervals of the gains are too narrow"):
+        fit = cp.fit_feedforward(logged(t=t, seed=1, position=1e-5))
     assert max(errors(fit).values()) <= 0.02
+
+
+def test_missing_samples_of_positions():
+    """A few lost samples do no harm; long gaps do, unless the plan is given."""
+    rng = np.random.default_rng(4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cp.fit_feedforward(logged(t=TIMES[rng.random(TIMES.size) > 0.1], seed=1, position=1e-4))
+        cp.fit_feedforward(logged(t=TIMES + rng.uniform(-4e-4, 4e-4, TIMES.size), seed=1, position=1e-4))
+    keep = np.ones(TIMES.size, dtype=bool)
+    keep[3000:3040] = False
+    half = TIMES[rng.random(TIMES.size) > 0.5]
+    for t, gap in ((TIMES[keep], "41 ms, 0.41 %"), (half, "ms, ")):
+        with pytest.warns(UserWarning, match=rf"got gaps of up to .*{gap}.* of the time"):
+            cp.fit_feedforward(logged(t=t, seed=1, position=1e-4))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            cp.fit_feedforward(logged(t=t, seed=1), PLAN)
 
 
 def test_one_axis_of_a_plan_of_several():
