@@ -375,7 +375,7 @@ def _root_from(
 ) -> float:
     """The same for a signal that is on its limit, which is inside, at one end; it may be held there for some time.
 
-    The end itself, if the signal may have left it at once: a power of the time up to the sixth is not
+    The end itself, if the signal may have left it immediately: a power of the time up to the sixth is not
     distinguished from the limit before the root that is found.
     """
     leaves = at_left == 0.0
